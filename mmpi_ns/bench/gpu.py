@@ -9,6 +9,7 @@ import platform
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
@@ -18,7 +19,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from mmpi_ns.bench.trainers import JOINT, P, Scene, Steps, no_tracks, train_words
+from mmpi_ns.bench.trainers import JOINT, NO_TRACKS, P, Scene, Steps, train_words
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.layout import EVERY, SMALL, Shapes
 from mmpi_ns.utils.machine import processor
@@ -45,17 +46,40 @@ class Gpu:
             raise ValueError(
                 "torch sees no CUDA device: run it where there is one, or try this processor with --quick."
             )
-        data, shapes = noise(self.folder / "noise"), (SMALL,) if self.quick else EVERY
-        report = run_quick(data, (self.folder / "run").resolve(), RAYS, shapes)
+        tell = partial(print, flush=True)
+        report: dict[str, Any] = {"environment": environment()}
+        for name, value in report["environment"].items():
+            tell(f"{name}: {value}")
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        if device == "cpu":
+            tell("torch sees no GPU, so nothing is said of one here: what follows is this machine's processor.")
+        report["device"] = device
+        report["operations"] = faults = try_operations(device, (SMALL,) if self.quick else EVERY)
+        for name, reason in faults.items():
+            tell(f"{name}: {'ok' if reason is None else 'plain torch, since ' + reason}")
+        slow = [name for name, reason in faults.items() if reason is not None]
+        report["timed"] = timed = time_training(device, noise(self.folder / "noise"), (self.folder / "run").resolve())
+        step, frame, pixels = timed["step_ms"], timed["frame_ms"], timed["pixels"]
+        tell(f"a step of {RAYS} rays: {step:.1f} ms, {1e3 * RAYS / step:,.0f} rays/s")
+        tell(f"a frame of {pixels} pixels: {frame:.1f} ms, {1e3 / frame:.1f} frames/s")
+        tell(f"memory: {timed['peak_gib']:.2f} GiB")
+        report["well"] = device == "cuda" and not slow
+        if slow:
+            fate = f"{len(slow)} operation(s) run in plain torch, several times slower: {', '.join(slow)}."
+            tell(f"Training works, but {fate}")
+        elif device == "cuda":
+            tell("All is well: every kernel runs on this GPU and agrees with plain torch.")
+        else:
+            tell("Training works on this processor. Whether it would on a GPU, only a machine with one can say.")
         (self.folder / "gpu.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
 
 
-def noise(folder: Path, count: int = 10, width: int = 155, height: int = 47) -> Path:
+def noise(folder: Path) -> Path:
     """The folder of a drive past random colours, which is written where it is not there yet: enough to time a step."""
     if not (folder / "transforms.json").is_file():
         (folder / "images").mkdir(parents=True, exist_ok=True)
-        rng, frames = np.random.default_rng(0), []
-        for i in range(count):
+        rng, frames, (width, height) = np.random.default_rng(0), [], (155, 47)
+        for i in range(10):
             image = Image.fromarray(rng.integers(0, 256, (6, 20, 3), dtype=np.uint8)).resize((width, height))
             image.save(folder / f"images/{i}.png")
             pose = np.vstack([np.eye(3, 4), [0, 0, 0, 1]])
@@ -89,7 +113,7 @@ def environment() -> dict[str, Any]:
     return report
 
 
-def try_operations(device: str, every: Sequence[Shapes] = (SMALL,)) -> dict[str, str | None]:
+def try_operations(device: str, every: Sequence[Shapes]) -> dict[str, str | None]:
     """Every operation with a compiled form for a device: None where it works for all shapes, else why not."""
     form = "gpu" if device == "cuda" else "cpu"
     faults: dict[str, str | None] = {n: None for n, each in dispatch.operations().items() if form in each.compiled}
@@ -101,49 +125,16 @@ def try_operations(device: str, every: Sequence[Shapes] = (SMALL,)) -> dict[str,
     return faults
 
 
-def time_training(device: str, data: Path, work: Path, rays: int) -> dict[str, Any]:
+def time_training(device: str, data: Path, work: Path) -> dict[str, Any]:
     """Milliseconds of a step and of a frame of a small capture."""
     manager = [f"--pipeline.datamanager.{name}" for name in ("dense-depth", "mask-moving", "correct-exposure")]
-    options = (*drive(64, rays), *(word for name in manager for word in (name, "False")), *no_tracks())
+    options = (*drive(64, RAYS), *(word for name in manager for word in (name, "False")), *NO_TRACKS)
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of others' deprecations
         steps = Steps(train_words("mmpi-small", options, Scene(data, 1), work, 10 * STEPS, 0, device))
         steps.run(2)  # compiles
         seconds = steps.run(STEPS) / STEPS
         frame, pixels = min(steps.render(larger=2) for _ in range(3))
-    timed = {"step_ms": 1e3 * seconds, "rays": rays, "frame_ms": 1e3 * frame, "pixels": pixels}
+    timed = {"step_ms": 1e3 * seconds, "rays": RAYS, "frame_ms": 1e3 * frame, "pixels": pixels}
     peak = torch.cuda.max_memory_allocated() if device == "cuda" else 1024 * getrusage(RUSAGE_SELF).ru_maxrss
     return timed | {"peak_gib": peak / 2**30}
-
-
-def run_quick(data: Path, work: Path, rays: int, every: Sequence[Shapes] = (SMALL,)) -> dict[str, Any]:
-    """Looks, tries, times, and says so line by line: environment, operations (why each falls back, or None), times of
-    a small scene, and ``well``, the verdict."""
-    report: dict[str, Any] = {"environment": environment()}
-    for name, value in report["environment"].items():
-        print(f"{name}: {value}", flush=True)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    if device == "cpu":
-        print(
-            "torch sees no GPU, so nothing is said of one here: what follows is this machine's processor.", flush=True
-        )
-    report["device"], report["operations"] = device, try_operations(device, every)
-    slow = {name: reason for name, reason in report["operations"].items() if reason is not None}
-    for name in report["operations"]:
-        print(f"{name}: {'plain torch, since ' + slow[name] if name in slow else 'ok'}", flush=True)
-    report["timed"] = timed = time_training(device, data, work, rays)
-    step, frame, pixels = timed["step_ms"], timed["frame_ms"], timed["pixels"]
-    print(f"a step of {rays} rays: {step:.1f} ms, {1e3 * rays / step:,.0f} rays/s", flush=True)
-    print(f"a frame of {pixels} pixels: {frame:.1f} ms, {1e3 / frame:.1f} frames/s", flush=True)
-    print(f"memory: {timed['peak_gib']:.2f} GiB", flush=True)
-    report["well"] = device == "cuda" and not slow
-    if slow:
-        fate = f"{len(slow)} operation(s) run in plain torch, several times slower: {', '.join(slow)}."
-        print(f"Training works, but {fate}", flush=True)
-    elif device == "cuda":
-        print("All is well: every kernel runs on this GPU and agrees with plain torch.", flush=True)
-    else:
-        print(
-            "Training works on this processor. Whether it would on a GPU, only a machine with one can say.", flush=True
-        )
-    return report

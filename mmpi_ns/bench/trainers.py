@@ -13,6 +13,8 @@ import torch
 
 P = "--pipeline.model.placement."
 JOINT = ("--pipeline.model.schedule.training", "joint")
+NO_TRACKS = ("--pipeline.datamanager.sfm-path", "none", "--pipeline.datamanager.triangulate", "False")
+"""Options of our methods that leave pycolmap out: points are looked for by a plane sweep."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ def train_words(
         seed: of every random draw.
         device: cpu or cuda.
     """
-    tracks = no_tracks() if method.startswith("mmpi") and not has_pycolmap() else ()
+    tracks = NO_TRACKS if method.startswith("mmpi") and not has_pycolmap() else ()
     words = [method, *options, *tracks, "--machine.seed", str(seed)]
     words += ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
     words += ["--machine.device-type", device, "--max-num-iterations", str(steps), "--steps-per-save", str(10**9)]
@@ -53,11 +55,6 @@ def train_words(
 def has_pycolmap() -> bool:
     """Whether a COLMAP model can be read, and features be triangulated."""
     return importlib.util.find_spec("pycolmap") is not None
-
-
-def no_tracks() -> tuple[str, ...]:
-    """Options of our methods that leave pycolmap out: points are looked for by a plane sweep."""
-    return ("--pipeline.datamanager.sfm-path", "none", "--pipeline.datamanager.triangulate", "False")
 
 
 def config_of(words: Sequence[str]) -> Any:

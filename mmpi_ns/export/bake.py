@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -20,13 +20,10 @@ from torch import Tensor
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
-from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.images import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
-
-Say = Callable[[str], None]
 
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
@@ -57,13 +54,12 @@ def load_model(load_config: Path) -> Any:
     return pipeline
 
 
-def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
+def bake_run(pipeline: Any, least: float) -> BakedScene:
     """All windows of a finished run, baked.
 
     Args:
         pipeline: of the run.
         least: bricks in which no training view sees this weight are left out; 0 keeps all.
-        say: called with progress messages.
 
     Raises:
         ValueError: the model cannot be baked (says why).
@@ -75,24 +71,22 @@ def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
         window_shares(cameras.camera_to_worlds[:, :, 3], places) if len(places) > 1 else torch.ones(len(cameras), 1)
     )
 
-    def seen_peaks(window: BakedWindow, views: list[int]) -> Tensor:
-        alike = sorted(views, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
-        pixels = float((cameras.width * cameras.height)[views].sum())
-        step = math.ceil((pixels / MOST_LOOKED_AT) ** 0.5)
-
-        def rays_of(i: int) -> tuple[Tensor, Tensor]:
-            rays = image_rays(cameras[i : i + 1], step).flatten()
-            return rays.origins.contiguous(), rays.directions.contiguous()
-
-        return window.peaks(alike, rays_of)
+    def rays_of(step: int, i: int) -> tuple[Tensor, Tensor]:
+        rays = image_rays(cameras[i : i + 1], step).flatten()
+        return rays.origins.contiguous(), rays.directions.contiguous()
 
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
         whole = model.baked(field)
-        peaks = seen_peaks(whole, (shares[:, number] > 0).nonzero()[:, 0].tolist())
+        views = (shares[:, number] > 0).nonzero()[:, 0].tolist()
+        step = math.ceil((float((cameras.width * cameras.height)[views].sum()) / MOST_LOOKED_AT) ** 0.5)
+        alike = sorted(views, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
+        peaks = whole.peaks(alike, partial(rays_of, step))
         kept = replace(whole, seen=peaks.sum((1, 2))).keep(peaks.amax((1, 2)) >= least)
-        say(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({least:g} or more).")
+        print(
+            f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({least:g} or more)."
+        )
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
     path = poses_of(pipeline)
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)

@@ -1,4 +1,5 @@
-"""Bundle adjustment: points of all matches, the lens as far as the images determine it, and how well they do."""
+"""Bundle adjustment: points of all matches or of known poses, the lens as far as the images determine it, and how well
+they do."""
 
 from __future__ import annotations
 
@@ -10,7 +11,9 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.capture.matching import MIN_ANGLE, quiet, triangulate_points
-from mmpi_ns.utils.errors import progress, say
+from mmpi_ns.prepare.alignment import camera_poses, degrees_between, similarity_between
+from mmpi_ns.prepare.features import matched_keypoints
+from mmpi_ns.utils.errors import InputError, progress, say
 
 STILL = 1e-6
 """Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive
@@ -25,6 +28,14 @@ PARTS = 20
 """Number of images from which the two halves of a capture are also used separately to judge the focal length."""
 WIDE = 0.08
 """Width of the interval of the focal length, relative to it, from which --focal is asked for."""
+REFINE_ROUNDS = 3
+"""Rounds of refining known poses and triangulating points again."""
+COARSE_PX, FINE_PX = 8.0, 4.0
+"""Largest reprojection error of a point of known poses: while these are to be refined, and in the end."""
+LEAST_SHARE = 0.2
+"""Fraction of the matched keypoints that must become points; few do where known poses are those of other images."""
+BENT_PX = 0.8
+"""Mean reprojection error above which another attempt is made even though the images are registered."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +137,21 @@ def rms_error(model: pycolmap.Reconstruction) -> float:
     return float(np.sqrt((errors**2 * lengths).sum() / max(int(lengths.sum()), 1)))
 
 
+def quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
+    """Sorts models by soundness, then by number of images, then by fit.
+
+    Errors are those at an image width of 1,000 pixels, or in pixels of smaller images.
+    """
+    widest = max(camera.width for camera in model.cameras.values())
+    error = model.compute_mean_reprojection_error() / max(1.0, widest / 1000)
+    return error <= BENT_PX, model.num_reg_images(), -error
+
+
+def is_bent(model: pycolmap.Reconstruction) -> bool:
+    """Whether a model fits its images so badly that it may have started from a wrong pair: squeezed or folded."""
+    return not quality(model)[0]
+
+
 def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """A copy with the points that most images see, ENOUGH_POINTS for each image: as telling, and quickly adjusted."""
     light = copy.deepcopy(model)
@@ -185,3 +211,52 @@ def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float,
 def focal_in_words(low: float, high: float) -> str:
     """The interval of a focal length, for the report."""
     return f"between {low:.1f} and {high:.1f} px, {(high - low) / high:.1%} wide"
+
+
+def map_known_poses(
+    model: pycolmap.Reconstruction, database: Path, images: Path, refine_poses: bool, refine_lens: bool, threads: int
+) -> tuple[pycolmap.Reconstruction, str]:
+    """Triangulates points from the poses of a model, and refines these.
+
+    Args:
+        model: cameras and posed images without points; changed in place.
+        database: features and matches.
+        images: folder of the images.
+        refine_poses: bundle-adjust poses; the result is aligned with the given scale and frame.
+        refine_lens: bundle-adjust intrinsics as well.
+        threads: CPU threads; below 1 for all.
+
+    Returns:
+        The model with points, and what was done in words.
+
+    Raises:
+        InputError: the poses do not fit the matches.
+    """
+    _, before = camera_poses(model)
+    refines = refine_poses or refine_lens
+    with quiet():
+        model = triangulate_points(model, database, images, threads, COARSE_PX if refines else FINE_PX)
+    share = model.compute_num_observations() / max(matched_keypoints(database, list(model.reg_image_ids())), 1)
+    if share < LEAST_SHARE:
+        raise InputError(
+            f"Only {share:.0%} of the matched keypoints become points from the given poses: the camera axes "
+            "(--poses-axes opencv or opengl), the order of the images, the direction (camera "
+            "to world is wanted) or the intrinsics (--focal, --camera) are not what the poses were made with."
+        )
+    error = model.compute_mean_reprojection_error()
+    says = f"points from known poses: {share:.0%} of the matched keypoints, {error:.2f} px"
+    if refines:
+        for _ in range(REFINE_ROUNDS):
+            adjust(model, threads, refine_lens, poses=refine_poses)
+            with quiet():
+                model = triangulate_points(model, database, images, threads, FINE_PX)
+        model.transform(similarity_between(camera_poses(model)[1], before))
+        _, after = camera_poses(model)
+        moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=-1)
+        turned = degrees_between(after[:, :3, :3], before[:, :3, :3])
+        says += (
+            f"; refined, {model.compute_mean_reprojection_error():.2f} px; poses moved by {moved.mean():.3g} units (at "
+            f"most {moved.max():.3g}) and turned by {turned.mean():.2f} degrees (at most {turned.max():.2f})"
+        )
+    say(says)
+    return model, says

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import InputError
 
 Array = NDArray[np.float64]
 ROTATION_WEIGHT = 1.0
@@ -68,28 +66,6 @@ def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
     return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)
 
 
-@dataclass(frozen=True)
-class SceneFrame:
-    """Transform from the model to the scene, and its sources in words."""
-
-    similarity: pycolmap.Sim3d
-    """Scene from model."""
-    up: str
-    """Source of the up direction, in words."""
-    unit: str
-    """The unit, in words."""
-
-
-def up_from_cameras(poses: Array) -> Array:
-    """Up, assuming level cameras: perpendicular to all right vectors if they turn, else the mean up vector. [3]"""
-    mean = -poses[:, :3, 1].mean(0)
-    mean /= max(float(np.linalg.norm(mean)), 1e-12)
-    values, vectors = np.linalg.eigh(poses[:, :3, 0].T @ poses[:, :3, 0] / len(poses))
-    level = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
-    turns_enough = values[1] > LEVEL_TURN and values[0] < 0.1 * values[1]
-    return level if turns_enough and level @ mean > 0.5 else mean
-
-
 def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     """The plane that the cameras stand over: the most populous among roughly level ones, by RANSAC.
 
@@ -102,7 +78,7 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
         Unit normal towards the cameras [3], and the cameras' median height above the plane.
 
     Raises:
-        PrepareError: too few points below the cameras, or no plane among them.
+        InputError: too few points below the cameras, or no plane among them.
     """
     # Points below the nearest camera and near the track.
     some = centers[:: max(1, len(centers) // 32)]
@@ -112,7 +88,7 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     across = np.linalg.norm(offset - height[:, None] * up, axis=-1)
     below = points[(height < 0) & (-height > 0.05 * across) & (across < reach)]
     if len(below) < LEAST_GROUND:
-        raise PrepareError(
+        raise InputError(
             f"--camera-height: only {len(below)} points lie below the cameras: too few to find the ground."
         )
     tolerance = 0.04 * abs(float(np.median(-((below - np.median(centers, axis=0)) @ up))))
@@ -126,29 +102,39 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
         near = np.abs((below - a) @ normal) < tolerance * length
         inside = near if near.sum() > inside.sum() else inside
     if inside.sum() < GROUND_SHARE * len(below):
-        raise PrepareError("--camera-height: the points below the cameras lie on no common plane.")
+        raise InputError("--camera-height: the points below the cameras lie on no common plane.")
     center = below[inside].mean(0)
     normal = np.linalg.eigh((below[inside] - center).T @ (below[inside] - center))[1][:, 0]
     normal *= np.sign(normal @ up)
     return normal, float(np.median((centers - center) @ normal))
 
 
-def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> SceneFrame:
+def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> tuple[pycolmap.Sim3d, str, str]:
     """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
+
+    Without a ground, cameras are assumed level: up is perpendicular to all right vectors if they turn, else the mean up
+    vector.
 
     Args:
         model: in its own frame.
         camera_height: metres above the ground, or None: then one unit is the extent of the track.
+
+    Returns:
+        The transform from the model to the scene, and the sources of up and of the unit in words.
     """
     _, poses = camera_poses(model)
     centers = poses[:, :3, 3]
-    up = up_from_cameras(poses)
-    words = "mean of the cameras, assumed level"
+    up, words = -poses[:, :3, 1].mean(0), "mean of the cameras, assumed level"
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    values, vectors = np.linalg.eigh(poses[:, :3, 0].T @ poses[:, :3, 0] / len(poses))
+    level = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
+    if values[1] > LEVEL_TURN and values[0] < 0.1 * values[1] and level @ up > 0.5:
+        up = level
     if camera_height is not None:
         points = np.array([p.xyz for p in model.points3D.values()])
         up, height = fit_ground(points, centers, up)
         if height <= 0:
-            raise PrepareError("--camera-height: the ground found lies above the cameras.")
+            raise InputError("--camera-height: the ground found lies above the cameras.")
         scale, words = camera_height / height, "normal of the ground"
         unit = f"1 metre, from a camera height of {camera_height:g} m above the ground"
     else:
@@ -160,4 +146,4 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
     heading = heading / np.linalg.norm(heading)
     rotation = np.stack([np.cross(heading, up), heading, up])
     similarity = pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), -scale * rotation @ centers.mean(0))
-    return SceneFrame(similarity, words, unit)
+    return similarity, words, unit

@@ -15,11 +15,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.exif import light_of
-from mmpi_ns.prepare.adjustment import WIDE, adjust, focal_in_words, with_fewer_points
+from mmpi_ns.prepare.adjustment import WIDE, adjust, focal_in_words, is_bent, with_fewer_points
 from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between
 from mmpi_ns.prepare.evidence import local_median
 from mmpi_ns.prepare.images import in_short
-from mmpi_ns.prepare.mapping import is_bent
 from mmpi_ns.utils.files import write_text
 
 SIDE = 640

@@ -65,7 +65,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Witness:
-    """The model of one mapper, reduced to its evidence."""
+    """The model of one mapper, and the evidence on it."""
 
     name: str
     """Of the mapper."""
@@ -78,10 +78,11 @@ class Witness:
     pairs: Pairs
     focal: float
     """Mean focal length over the longer side."""
-    error: float
-    """Mean reprojection error, pixels."""
     scales: Array
     """Logarithm of the change of scale across each gap, reduced to its certain part; NaN if unknown. [N - 1]"""
+    says: str
+    """How the mapper made it, in words."""
+    model: pycolmap.Reconstruction
 
 
 @dataclass(frozen=True)
@@ -96,11 +97,12 @@ class Agreement:
     """Degrees between the rotations. [N]"""
 
 
-def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
+def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
     """The evidence on a mapper's model.
 
     Args:
         name: of the mapper.
+        says: how it made the model, in words.
         model: poses and points, with the keypoints of the database.
         database: verified matches.
         offered: names of all images of the capture, in order.
@@ -129,8 +131,9 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
         poses,
         _pair_evidence(model, database, points, rays),
         camera.mean_focal_length() / max(camera.width, camera.height),
-        model.compute_mean_reprojection_error(),
         scale_changes(points_seen, frames, centers, directions, len(names)),
+        says,
+        model,
     )
 
 
@@ -173,21 +176,12 @@ def bridges(pairs: Pairs, count: int, part: Array, whole: Array | None = None) -
         Fractions; NaN if there are too few matches across. [N - 1]
     """
     near = pairs.second - pairs.first <= REACH
-    totals = np.zeros((2, count + 1))
-    for row, values in enumerate((part, pairs.matches if whole is None else whole)):
-        np.add.at(totals[row], pairs.first[near], values[near])
-        np.add.at(totals[row], pairs.second[near], -values[near])
-    held, crossing = np.cumsum(totals, axis=1)[:, : max(count - 1, 0)]
+    first, second = pairs.first[near], pairs.second[near]
+    held, crossing = (
+        np.cumsum(np.bincount(first, x[near], count) - np.bincount(second, x[near], count))[:-1]
+        for x in (part, pairs.matches if whole is None else whole)
+    )
     return np.where(crossing >= FEW, held / np.maximum(crossing, 1), np.nan)
-
-
-def held_by_image(pairs: Pairs, count: int) -> Array:
-    """Share of each image's matches that became points; NaN where it has few. [N]"""
-    held, matches = np.zeros(count), np.zeros(count)
-    for ends in (pairs.first, pairs.second):
-        np.add.at(held, ends, pairs.tracked)
-        np.add.at(matches, ends, pairs.matches)
-    return np.where(matches >= FEW, held / np.maximum(matches, 1), np.nan)
 
 
 def held_by_side(pairs: Pairs, count: int) -> Array:
@@ -196,10 +190,10 @@ def held_by_side(pairs: Pairs, count: int) -> Array:
     An image that is misplaced, alone or at a break, contradicts all images of one side, while most matches across the
     gaps beside it, which join other images, may hold.
     """
-    held, matches = np.zeros((2, count)), np.zeros((2, count))
-    for side, ends in enumerate((pairs.second, pairs.first)):
-        np.add.at(held[side], ends, pairs.fitting)
-        np.add.at(matches[side], ends, pairs.matches)
+    held, matches = (
+        np.stack([np.bincount(ends, x, count) for ends in (pairs.second, pairs.first)])
+        for x in (pairs.fitting, pairs.matches)
+    )
     return np.where(matches >= FEW_OF_ONE, held / np.maximum(matches, 1), np.nan)
 
 
@@ -252,33 +246,27 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
     return result
 
 
-def steps(witness: Witness) -> Array:
-    """Distances from frame to frame, divided over missing frames. [N - 1]"""
-    return np.linalg.norm(np.diff(witness.poses[:, :3, 3], axis=0), axis=-1) / np.maximum(np.diff(witness.places), 1)
-
-
-def jumps(witness: Witness) -> Array:
-    """Length of each step relative to the median of the steps around it. [N - 1]"""
-    lengths = steps(witness)
-    floor = 0.05 * float(np.median(lengths)) if len(lengths) else 0.0
-    return lengths / np.maximum(local_median(lengths, WINDOW) + floor, 1e-12)
-
-
 def local_median(values: Array, reach: int) -> Array:
     """Median of the neighbours of each value, excluding itself. [N] -> [N]"""
     rows = [np.delete(values[max(0, i - reach) : i + reach + 1], min(i, reach)) for i in range(len(values))]
     return np.array([np.median(row) if len(row) else values[i] for i, row in enumerate(rows)])
 
 
-def speed_changes(witness: Witness) -> Array:
-    """Ratio, at least 1, of the median steps after and before each frame; 1 near the ends, where there are few. [N]"""
-    lengths = steps(witness)
-    result = np.ones(len(witness.places))
-    floor = 0.1 * float(np.median(lengths)) if len(lengths) else 0.0
+def strides(witness: Witness) -> tuple[Array, Array]:
+    """How even the steps from frame to frame are; a step over missing frames is divided among them.
+
+    Returns:
+        Length of each step relative to the median of the steps around it [N - 1]; ratio, at least 1, of the median
+        steps after and before each frame, 1 near the ends, where there are few [N].
+    """
+    lengths = np.linalg.norm(np.diff(witness.poses[:, :3, 3], axis=0), axis=-1) / np.maximum(np.diff(witness.places), 1)
+    usual = float(np.median(lengths)) if len(lengths) else 0.0
+    jumps = lengths / np.maximum(local_median(lengths, WINDOW) + 0.05 * usual, 1e-12)
+    changes = np.ones(len(witness.places))
     for i in range(WINDOW, len(lengths) - WINDOW + 1):
-        before, after = (float(np.median(lengths[s])) + floor for s in (slice(i - WINDOW, i), slice(i, i + WINDOW)))
-        result[i] = max(before, after) / max(min(before, after), 1e-12)
-    return result
+        before, after = (float(np.median(lengths[s : s + WINDOW])) + 0.1 * usual for s in (i - WINDOW, i))
+        changes[i] = max(before, after) / max(min(before, after), 1e-12)
+    return jumps, changes
 
 
 def agreement(first: Witness, second: Witness) -> Agreement | None:

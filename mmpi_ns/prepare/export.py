@@ -18,8 +18,7 @@ from mmpi_ns.capture.exif import kept_tags
 from mmpi_ns.capture.matching import quiet
 from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.images import Photo, read_intrinsics
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import progress
+from mmpi_ns.utils.errors import InputError, progress
 from mmpi_ns.utils.files import whole, write_text
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
@@ -40,7 +39,7 @@ class Split:
 
 
 def split_by_count(names: Sequence[str], test_every: int | None, train_every: int | None) -> Split:
-    """Every n-th image tests, or trains, from the middle of the first n on. Raises PrepareError if none is left."""
+    """Every n-th image tests, or trains, from the middle of the first n on. Raises InputError if none is left."""
     if test_every == 0:
         return Split(
             tuple(names),
@@ -52,30 +51,30 @@ def split_by_count(names: Sequence[str], test_every: int | None, train_every: in
     rest = {n for n in names if n not in picked}
     train, test = (picked, rest) if train_every else (rest, picked)
     if not train or not test:
-        raise PrepareError(f"One image in {every} of {len(names)} leaves nothing to train or to test: use another.")
+        raise InputError(f"One image in {every} of {len(names)} leaves nothing to train or to test: use another.")
     role = "trains, the others test" if train_every else "tests, the others train"
     says = f"one image in {every} {role}, from the {every // 2 + 1}. on"
     return Split(tuple(n for n in names if n in train), tuple(n for n in names if n in test), says)
 
 
 def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Split:
-    """The split of another scene's transforms.json; images it does not list are left out of both. Raises PrepareError
+    """The split of another scene's transforms.json; images it does not list are left out of both. Raises InputError
     if the lists name none of the images."""
     sides = []
     for key in ("train_filenames", "test_filenames"):
         listed = {Path(str(n)).name for n in lists[key]}
         sides.append(tuple(n for n in names if n in listed))
         if not sides[-1]:
-            raise PrepareError(f"None of the {len(listed)} {key} of {source} is among the registered images.")
+            raise InputError(f"None of the {len(listed)} {key} of {source} is among the registered images.")
     return Split(sides[0], sides[1], f"as listed in {source}")
 
 
 def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes: dict[str, Any]) -> dict[str, Any]:
-    """transforms.json for the registered images; intrinsics that all share are at the top level. Raises PrepareError if
+    """transforms.json for the registered images; intrinsics that all share are at the top level. Raises InputError if
     nerfstudio-data reads no scene with these lenses."""
     lenses = {number: read_intrinsics(camera) for number, camera in model.cameras.items()}
     if len({lens.fisheye for lens in lenses.values()}) > 1:
-        raise PrepareError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
+        raise InputError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
     is_fisheye = any(lens.fisheye for lens in lenses.values())
     keys = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2")
     entries: dict[int, dict[str, Any]] = {}

@@ -17,9 +17,8 @@ from typing import Literal
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.cluster.vq import kmeans2, vq
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from mmpi_ns.capture.matching import (
     MIN_INLIERS,
@@ -32,8 +31,7 @@ from mmpi_ns.capture.matching import (
     write_images,
 )
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import progress
+from mmpi_ns.utils.errors import InputError, progress
 from mmpi_ns.utils.files import whole
 
 BATCH = 8
@@ -80,22 +78,17 @@ def create_database(
 
 def extract(
     database: Path, images: Path, photos: Sequence[Photo], masks: Path | None, max_features: int, threads: int
-) -> list[int]:
+) -> None:
     """SIFT features of all images; images that have theirs are skipped.
 
     Weak features count too if most of a sample of the images have less than half of the features that they may have.
-
-    Returns:
-        Features of each image.
-
-    Raises:
-        PrepareError: an image cannot be read, or hardly any has features.
+    Raises InputError if an image cannot be read, or hardly any has features.
     """
+    names = [p.name for p in photos]
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.max_image_size = threads, LARGEST_SIDE
     most = max(p.width * p.height for p in photos) // PIXELS_A_FEATURE
     options.sift.max_num_features = min(max_features, max(most, LEAST_FEATURES))
-    names = [p.name for p in photos]
     with quiet():
         is_poor = most < LEAST_FEATURES
         if not is_poor:
@@ -113,13 +106,12 @@ def extract(
                 advance(len(names[start : start + BATCH]))
     counts = count_features(database)
     if None in counts:
-        raise PrepareError(f"{names[counts.index(None)]} cannot be read by COLMAP: repair or remove it.")
-    numbers = [n or 0 for n in counts]
-    if sum(n >= FEATURES for n in numbers) < 2:
-        raise PrepareError(
-            f"Hardly any features: {max(numbers)} in the best image. The images are blank, blurred or masked over."
+        raise InputError(f"{names[counts.index(None)]} cannot be read by COLMAP: repair or remove it.")
+    counted = [n or 0 for n in counts]
+    if sum(n >= FEATURES for n in counted) < 2:
+        raise InputError(
+            f"Hardly any features: {max(counted)} in the best image. The images are blank, blurred or masked over."
         )
-    return numbers
 
 
 def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:
@@ -143,15 +135,13 @@ def matching_pairs(database: Path) -> list[tuple[int, int]]:
     return [pycolmap.pair_id_to_image_pair(p) for p, n in zip(pairs, inliers, strict=True) if n >= MIN_INLIERS]
 
 
-def connected(database: Path, places: Sequence[int]) -> list[list[int]]:
-    """Groups of at least three of some images (by their places) that verified matches connect, the largest first."""
-    row = {place + 1: n for n, place in enumerate(places)}
-    edges = [(row[a], row[b]) for a, b in matching_pairs(database) if a in row and b in row]
-    ends = np.array(edges, dtype=int).reshape(-1, 2).T
-    graph = coo_array((np.ones(len(edges)), tuple(ends)), shape=(len(places), len(places)))
-    _, labels = connected_components(graph, directed=False)
-    groups = [[places[i] for i in np.flatnonzero(labels == label)] for label in np.unique(labels)]
-    return sorted((g for g in groups if len(g) > 2), key=len, reverse=True)
+def connected(database: Path, image_ids: Sequence[int]) -> list[list[int]]:
+    """Groups of at least three of these images that verified matches connect, the largest first."""
+    groups = DisjointSet(image_ids)
+    for first, second in matching_pairs(database):
+        if first in groups and second in groups:
+            groups.merge(first, second)
+    return sorted((sorted(group) for group in groups.subsets() if len(group) > 2), key=len, reverse=True)
 
 
 def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:
@@ -205,41 +195,36 @@ def are_numbered(names: Sequence[str]) -> bool:
     return len(varying) == 1
 
 
-def choose(matching: Matching, names: Sequence[str], alike: NDArray[np.float32], from_video: bool) -> tuple[str, str]:
-    """Way of matching, and the reason in words."""
-    count = len(names)
-    if matching != "auto":
-        return matching, "as asked"
-    if count <= FEW:
-        return "exhaustive", f"{count} images are few"
-    if from_video:
-        return "sequential", "frames of a video"
-    nearest_in_time = np.abs(alike.argmax(-1) - np.arange(count)) <= 3
-    if are_numbered(names) and nearest_in_time.mean() > 0.7:
-        return "sequential", "numbered frames that look like their neighbours"
-    if count <= MANY:
-        return "exhaustive", f"{count} images in no order"
-    return "retrieval", f"{count} images in no order are too many to match all"
-
-
-def list_pairs(matching: str, alike: NDArray[np.float32], overlap: int) -> Pairs:
-    """Pairs (i < j) for a way of matching."""
-    count = len(alike)
+def choose_pairs(
+    matching: Matching, names: Sequence[str], alike: NDArray[np.float32], overlap: int, from_video: bool
+) -> tuple[Pairs, str]:
+    """Pairs (i < j) to match, and how and why they were chosen in words."""
+    count, why = len(names), "as asked"
+    if matching == "auto":
+        nearest_in_time = np.abs(alike.argmax(-1) - np.arange(count)) <= 3
+        if count <= FEW:
+            matching, why = "exhaustive", f"{count} images are few"
+        elif from_video:
+            matching, why = "sequential", "frames of a video"
+        elif are_numbered(names) and nearest_in_time.mean() > 0.7:
+            matching, why = "sequential", "numbered frames that look like their neighbours"
+        elif count <= MANY:
+            matching, why = "exhaustive", f"{count} images in no order"
+        else:
+            matching, why = "retrieval", f"{count} images in no order are too many to match all"
+    says = f"{matching} ({why})"
     if matching == "exhaustive":
-        return [(i, j) for i in range(count) for j in range(i + 1, count)]
+        return [(i, j) for i in range(count) for j in range(i + 1, count)], says
     if matching == "retrieval":
-        return _look_alikes(alike, LOOK_ALIKES)
+        return _look_alikes(alike, LOOK_ALIKES), says
     steps = [*range(1, overlap + 1), *(s for s in FAR_STEPS if s > overlap)]
     near = {(i, i + s) for s in steps for i in range(count - s)}
-    return sorted(near | set(revisits(alike, overlap)))
-
-
-def revisits(alike: NDArray[np.float32], overlap: int) -> Pairs:
-    """Pairs of a sequence that may show a place again: as similar as images a few frames apart."""
-    apart = np.abs(np.subtract.outer(np.arange(len(alike)), np.arange(len(alike))))
-    edge = alike[apart == min(overlap, len(alike) - 1)]
+    # Pairs that may show a place again: as similar as images a few frames apart.
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    edge = alike[apart == min(overlap, count - 1)]
     usable = (apart > max(FAR_STEPS[-1], overlap)) & (alike >= np.percentile(edge, 25))
-    return _look_alikes(np.where(usable, alike, -np.inf), REVISITS)
+    revisits = _look_alikes(np.where(usable, alike, -np.inf), REVISITS)
+    return sorted(near.union(revisits)), f"{says}, {len(revisits)} pairs that may be revisits"
 
 
 def _look_alikes(alike: NDArray[np.float32], number: int) -> Pairs:

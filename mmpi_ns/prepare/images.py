@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,9 +14,8 @@ import pycolmap
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from mmpi_ns.capture.exif import kept_tags, positive_number
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import progress, say
-from mmpi_ns.utils.files import whole, write_text
+from mmpi_ns.utils.errors import InputError, progress, say
+from mmpi_ns.utils.files import whole
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 HEIF = (".heic", ".heif")
@@ -25,6 +23,7 @@ HEIF = (".heic", ".heif")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
 SUFFIXES = re.compile(rf"({'|'.join(map(re.escape, IMAGES))}){{1,2}}$", re.IGNORECASE)
 """Of a mask: a.jpg.png is that of a.jpg."""
+BODY_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
 FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 KEPT = {"JPEG": (".jpg", ".jpeg"), "PNG": (".png",)}
 """Formats that are copied unchanged; others become PNG."""
@@ -55,10 +54,10 @@ class Photo:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """The images in a folder in natural order; in its subfolders if it has none itself. Raises PrepareError for fewer
+    """The images in a folder in natural order; in its subfolders if it has none itself. Raises InputError for fewer
     than two."""
     if not folder.is_dir():
-        raise PrepareError(f"{folder} is no folder of images and no video ({', '.join(VIDEOS)}).")
+        raise InputError(f"{folder} is no folder of images and no video ({', '.join(VIDEOS)}).")
     readable = (*IMAGES, *(HEIF if reads_heif() else ()))
     files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
     images = [p for p in files if p.suffix.lower() in readable]
@@ -75,7 +74,7 @@ def find_images(folder: Path) -> list[Path]:
         say(f"{len(names)} {kind} files {why} ({in_short(names)}).", "yellow")
     if len(images) < 2:
         count = "no image" if not images else f"one image only ({images[0].name})"
-        raise PrepareError(
+        raise InputError(
             f"{folder} holds {count} ({', '.join(readable)}): a scene needs at least two views, better twenty."
         )
     return sorted(images, key=lambda p: natural_key(str(p.relative_to(folder))))
@@ -117,8 +116,8 @@ def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
 
 
 def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
-    """Copies images upright into ``target/images``, unless they are there, and notes their sizes and EXIF. Raises
-    PrepareError naming an image that cannot be read."""
+    """Copies images upright into ``target/images``, unless they are there; reads sizes and EXIF. Raises InputError
+    naming an image that cannot be read."""
     (target / "images").mkdir(parents=True, exist_ok=True)
     photos = []
     with progress("Reading images", len(files)) as advance:
@@ -135,37 +134,23 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
                     else:
                         _convert(image, partial, copy.suffix.lower())
             shot = exif.get_ifd(ExifTags.IFD.Exif)
-            parts = [
-                exif.get(ExifTags.Base.Make),
-                exif.get(ExifTags.Base.Model),
-                *(shot.get(tag) for tag in FOCAL_TAGS),
-            ]
+            parts = [exif.get(tag) for tag in BODY_TAGS] + [shot.get(tag) for tag in FOCAL_TAGS]
+            lens = " ".join(str(part).strip() for part in parts if part)
             focal = positive_number(shot.get(FOCAL_TAGS[1]))
             focal = focal and focal / FILM_WIDTH * max(size)
-            lens = " ".join(str(part).strip() for part in parts if part)
             photos.append(Photo(name, *size, lens, focal, str(file.relative_to(folder))))
             advance(1)
-    write_photos(photos, target)
     return photos
 
 
-def write_photos(photos: Sequence[Photo], target: Path) -> None:
-    write_text(target / "photos.json", json.dumps([asdict(p) for p in photos], indent=1))
-
-
-def read_photos(target: Path) -> list[Photo]:
-    """Photos as ``gather`` or the frame selection noted them."""
-    return [Photo(**entry) for entry in json.loads((target / "photos.json").read_text(encoding="utf-8"))]
-
-
 def open_image(path: Path) -> Image.Image:
-    """An image, decoded. Raises PrepareError naming the file if it cannot be read."""
+    """An image, decoded. Raises InputError naming the file if it cannot be read."""
     try:
         with Image.open(path) as image:
             image.load()
             return image
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
-        raise PrepareError(f"{path} cannot be read ({error}): repair or remove it.") from error
+        raise InputError(f"{path} cannot be read ({error}): repair or remove it.") from error
 
 
 def _convert(image: Image.Image, path: Path, suffix: str) -> None:
@@ -189,7 +174,7 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
         Images that had a mask; the others get an all-white one, since nerfstudio wants all or none.
 
     Raises:
-        PrepareError: no mask fits an image, or one has another size.
+        InputError: no mask fits an image, or one has another size.
     """
     files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES]
     bare = [SUFFIXES.sub("", p.relative_to(folder).as_posix()) for p in files]
@@ -206,13 +191,13 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
             count += 1
             mask = ImageOps.exif_transpose(open_image(source)).convert("L").point(lambda v: 255 if v else 0)
             if mask.size != (photo.width, photo.height):
-                raise PrepareError(
+                raise InputError(
                     f"Mask {source} is {mask.size[0]}x{mask.size[1]}, its image {photo.name} "
                     f"{photo.width}x{photo.height}: they must be of one size."
                 )
         mask.save(target / f"{photo.name}.png")
     if not count:
-        raise PrepareError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
+        raise InputError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
     if count < len(photos):
         say(f"{len(photos) - count} of {len(photos)} images have no mask: all their pixels are used.", "yellow")
     return count
@@ -232,70 +217,70 @@ class Intrinsics:
 
 
 def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
-    """The camera of ``--camera``. Raises PrepareError if the numbers fit none or a focal length is not positive."""
+    """The camera of ``--camera``. Raises InputError if the numbers fit none or a focal length is not positive."""
     if len(values) not in GIVEN_COUNTS:
-        raise PrepareError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
+        raise InputError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
     if len(values) == 3:
         values = (values[0], *values)
     if min(values[:2]) <= 0:
-        raise PrepareError("--camera: focal lengths must be positive, in pixels.")
+        raise InputError("--camera: focal lengths must be positive, in pixels.")
     lens = tuple(values[4:]) or (0.0,) * 4
     return Intrinsics(*values[:4], distortion=lens, fisheye=fisheye)  # type: ignore[arg-type]
 
 
-def share(photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics]) -> list[int]:
-    """Camera of each image, numbered from 1: images of one size, lens and given intrinsics share one. Raises
-    PrepareError if images of different sizes are to share one camera."""
-    if sharing == "per-image":
-        return list(range(1, len(photos) + 1))
-    sizes = {(p.width, p.height) for p in photos}
-    if sharing == "shared" and len(sizes) > 1:
-        listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
-        raise PrepareError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
-    numbers: dict[Any, int] = {}
-    keys = [(p.width, p.height, "" if sharing == "shared" else p.lens, lenses.get(p.name)) for p in photos]
-    return [numbers.setdefault(key, len(numbers) + 1) for key in keys]
-
-
 def make_cameras(
-    photos: Sequence[Photo], numbers: Sequence[int], lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
-) -> list[pycolmap.Camera]:
-    """One pycolmap camera for each number, from given intrinsics, else from EXIF, else guessed.
+    photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
+) -> tuple[list[int], list[pycolmap.Camera]]:
+    """Cameras from given intrinsics, else from EXIF, else guessed.
 
     Args:
         photos: the images.
-        numbers: camera of each image.
+        sharing: which of them share a camera; auto: those of one size, lens and known intrinsics.
         lenses: known intrinsics by image name.
         focal: focal length in pixels, from the command line.
         lens: distortion model if none is given.
+
+    Returns:
+        Camera of each image, numbered from 1, and the cameras in this order.
+
+    Raises:
+        InputError: images of different sizes are to share one camera.
     """
-    cameras: dict[int, pycolmap.Camera] = {}
-    for photo, number in zip(photos, numbers, strict=True):
-        if number in cameras:
-            continue
+    sizes = {(p.width, p.height) for p in photos}
+    if sharing == "shared" and len(sizes) > 1:
+        listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        raise InputError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
+    by_key: dict[Any, int] = {}
+    numbers: list[int] = []
+    cameras: list[pycolmap.Camera] = []
+    for photo in photos:
         intrinsics = lenses.get(photo.name)
+        key = (photo.width, photo.height, "" if sharing == "shared" else photo.lens, intrinsics)
+        number = by_key.setdefault(photo.name if sharing == "per-image" else key, len(cameras) + 1)
+        numbers.append(number)
+        if number <= len(cameras):
+            continue
         if intrinsics is not None:
             params = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
             is_bent = intrinsics.fisheye or any(intrinsics.distortion)
             model = "OPENCV_FISHEYE" if intrinsics.fisheye else "OPENCV" if is_bent else "PINHOLE"
             params += intrinsics.distortion if is_bent else ()
             size = {"width": photo.width, "height": photo.height, "camera_id": number}
-            cameras[number] = pycolmap.Camera(model=model, params=params, **size)
+            camera = pycolmap.Camera(model=model, params=params, **size)
         else:
             model = MODELS["radial" if lens == "auto" and focal is None else "pinhole" if lens == "auto" else lens]
             guess = focal or photo.exif_focal or GUESSED_FOCAL * max(photo.width, photo.height)
-            cameras[number] = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
-        cameras[number].has_prior_focal_length = bool(intrinsics or focal or photo.exif_focal)
-    return [cameras[n] for n in sorted(cameras)]
+            camera = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
+        camera.has_prior_focal_length = bool(intrinsics or focal or photo.exif_focal)
+        cameras.append(camera)
+    return numbers, cameras
 
 
 def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
-    """A pycolmap camera as OpenCV's. Raises PrepareError if nerfstudio-data does not support the lens model."""
-    name, p = camera.model.name, [float(v) for v in camera.params]
+    """A pycolmap camera as OpenCV's. Raises InputError if nerfstudio-data does not support the lens model."""
+    name, terms = camera.model.name, [float(v) for v in camera.params[camera.extra_params_idxs()]]
+    if name not in (*MODELS.values(), "SIMPLE_PINHOLE", "RADIAL"):
+        raise InputError(f"Lens model {name} is not supported in transforms.json.")
     f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    terms = {"SIMPLE_PINHOLE": [], "PINHOLE": [], "SIMPLE_RADIAL": p[3:], "RADIAL": p[3:]}
-    terms |= {"OPENCV": p[4:], "OPENCV_FISHEYE": p[4:]}
-    if name not in terms:
-        raise PrepareError(f"Lens model {name} is not supported in transforms.json.")
-    k1, k2, k3, k4 = (*terms[name], 0.0, 0.0, 0.0, 0.0)[:4]
+    k1, k2, k3, k4 = (*terms, 0.0, 0.0, 0.0, 0.0)[:4]
     return Intrinsics(*f, distortion=(k1, k2, k3, k4), fisheye=name == "OPENCV_FISHEYE")

@@ -1,4 +1,4 @@
-"""Poses and points from matches by COLMAP: image by image, all at once, or points alone where poses are known.
+"""Poses and points from matches by COLMAP, image by image and all at once, and the choice between what comes out.
 
 The incremental mapper's settings are relaxed until it succeeds. The global mapper (GLOMAP) averages the rotations of
 all pairs first, then solves for all positions and points together. It cannot start from a wrong pair, and the track
@@ -9,29 +9,29 @@ Source: Pan et al., Global Structure-from-Motion Revisited (2024), as in COLMAP 
 
 from __future__ import annotations
 
+import copy
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
-from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet, triangulate_points
-from mmpi_ns.prepare.adjustment import STILL, Free, adjust, with_all_points
-from mmpi_ns.prepare.alignment import camera_poses, degrees_between, similarity_between
-from mmpi_ns.prepare.features import matched_keypoints, matching_pairs
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import progress, say
+from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet
+from mmpi_ns.prepare.adjustment import STILL, Free, is_bent, polish, quality, with_all_points
+from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
+from mmpi_ns.prepare.features import matching_pairs
+from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, agrees, best_first, judge_alone, judge_together
+from mmpi_ns.utils.errors import InputError, progress, say
 
 ENOUGH = 0.95
 """Fraction of registered images at which no further attempt is made."""
 CARRIES = 0.5
 """Fraction of images from which a model is continued with looser settings instead of starting over."""
-BENT_PX = 0.8
-"""Mean reprojection error above which another attempt is made even though the images are registered."""
 SNAPSHOT = 40
 """Images registered between two snapshots, from which an interrupted run resumes."""
 MANY = 100
@@ -43,12 +43,13 @@ PLACED_ROUNDS = 2
 TRACKS_PER_VIEW = 500
 """Tracks used for placing each image globally, the longest ones: using all takes twice as long on kitti-street and is
 no better (docs/log/prepare.md)."""
-REFINE_ROUNDS = 3
-"""Rounds of refining known poses and triangulating points again."""
-COARSE_PX, FINE_PX = 8.0, 4.0
-"""Largest reprojection error of a point of known poses: while these are to be refined, and in the end."""
-LEAST_SHARE = 0.2
-"""Fraction of the matched keypoints that must become points; few do where known poses are those of other images."""
+STARTS = (0.7, 1.2)
+"""Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
+NEAR = 0.1
+"""Relative difference below which two initial focal lengths count as the same."""
+LEAST_POINTS = 0.05
+"""Share of the matches that must have become points of the global mapper's model, or it is none: it places every image
+whatever the focal length, and drops the points that do not fit."""
 
 
 @dataclass(frozen=True)
@@ -117,48 +118,33 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
         attempts: maximum number of attempts.
 
     Raises:
-        PrepareError: no attempt found an initial pair.
+        InputError: no attempt found an initial pair.
     """
     total, pairs = len(task.offered), len(matching_pairs(database))
     if not pairs:
-        raise PrepareError(
+        raise InputError(
             "No two images have enough matches in common: they do not overlap, or show too little texture. "
             "Take views with more overlap (two thirds and more)."
         )
     best: tuple[pycolmap.Reconstruction, Path] | None = None
     chosen, tried = "", []
     for attempt in ATTEMPTS[1 if task.is_sequence else 0 :][:attempts]:
-        carries = best is not None and not is_bent(best[0]) and best[0].num_reg_images() >= CARRIES * total
-        result = _run(task, attempt, database, best[1] if best is not None and carries else None)
+        carries = best and not is_bent(best[0]) and best[0].num_reg_images() >= CARRIES * total
+        result = _run(task, attempt, database, best[1] if best and carries else None)
         size = result[0].num_reg_images() if result else 0
         tried.append(f"{attempt.name} {size}")
         says = f", {result[0].compute_mean_reprojection_error():.2f} px" if result else ""
         say(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
-        if result and (best is None or _quality(result[0]) > _quality(best[0])):
+        if result and (best is None or quality(result[0]) > quality(best[0])):
             best, chosen = result, attempt.name
         if result and size >= ENOUGH * total and not is_bent(result[0]):
             break
     if best is None:
-        raise PrepareError(
+        raise InputError(
             f"No pair of images can start a reconstruction ({pairs} pairs have matches): the camera hardly moved "
             "(turning on the spot gives no depth), or the focal length is far off: check --focal and --camera."
         )
     return best[0], f"incremental, '{chosen}' settings ({', '.join(tried)})"
-
-
-def _quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
-    """Sorts models by soundness, then by number of images, then by fit.
-
-    Errors are those at an image width of 1,000 pixels, or in pixels of smaller images.
-    """
-    widest = max(camera.width for camera in model.cameras.values())
-    error = model.compute_mean_reprojection_error() / max(1.0, widest / 1000)
-    return error <= BENT_PX, model.num_reg_images(), -error
-
-
-def is_bent(model: pycolmap.Reconstruction) -> bool:
-    """Whether a model fits its images so badly that it may have started from a wrong pair: squeezed or folded."""
-    return not _quality(model)[0]
 
 
 def _run(
@@ -238,7 +224,7 @@ def mapper_options(
 
 
 def map_globally(
-    task: Task, name: str, database: Path, names: Sequence[str], threads: int
+    task: Task, name: str, focals: Mapping[int, float], names: Sequence[str], threads: int
 ) -> pycolmap.Reconstruction | None:
     """The largest model of the global mapper, None if there is none; read back where it was made before.
 
@@ -246,8 +232,8 @@ def map_globally(
 
     Args:
         task: what is to be mapped.
-        name: of the folder for the models.
-        database: features, verified matches and the cameras to start from.
+        name: of the start: its folder gets the models.
+        focals: focal lengths to start from, in pixels by camera id; the others are those of the database.
         names: the images to place.
         threads: CPU threads.
     """
@@ -255,6 +241,7 @@ def map_globally(
     if not (folder / "done").exists():
         shutil.rmtree(folder, ignore_errors=True)
         folders.mkdir(parents=True)
+        database = _start_from(task, name, focals)
         options = pycolmap.GlobalPipelineOptions()
         options.image_names = list(names)
         options.min_num_matches = MIN_INLIERS
@@ -276,50 +263,134 @@ def map_globally(
     return largest and largest[0]
 
 
-def map_known_poses(
-    model: pycolmap.Reconstruction, database: Path, images: Path, refine_poses: bool, refine_lens: bool, threads: int
-) -> tuple[pycolmap.Reconstruction, str]:
-    """Triangulates points from the poses of a model, and refines these.
+def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
+    """Runs the global mapper, then the incremental one from the focal length that fits, and chooses by the evidence.
 
-    Args:
-        model: cameras and posed images without points; changed in place.
-        database: features and matches.
-        images: folder of the images.
-        refine_poses: bundle-adjust poses; the result is aligned with the given scale and frame.
-        refine_lens: bundle-adjust intrinsics as well.
-        threads: CPU threads; below 1 for all.
+    The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse.
 
     Returns:
-        The model with points, and what was done in words.
+        Poses and points, the mappers in words, and how far they can be believed.
 
     Raises:
-        PrepareError: the poses do not fit the matches.
+        InputError: neither mapper makes a model.
     """
-    _, before = camera_poses(model)
-    refines = refine_poses or refine_lens
+    chosen, *others = _candidates(task)
+    with progress("Adding points", 1) as advance:
+        model = copy.deepcopy(chosen.model)
+        model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
+        advance()
+    model = polish(model, task.free, task.threads)
+    polished = witness_of(chosen.name, chosen.says, model, task.database, task.offered)
+    before, after = (ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished))
+    if after > before:
+        say("The final bundle adjustment makes the evidence worse: left out.", "yellow")
+    else:
+        chosen = polished
+    verdict = judge_together(chosen, others, task.is_ordered)
+    beside = [f"{w.says}, {judge_alone(w, task.is_ordered).grade} by itself" for w in others]
+    return chosen.model, "; beside it ".join([chosen.says, *beside]), verdict
+
+
+def _candidates(task: Task) -> list[Witness]:
+    """The models of both mappers, of the global one from several focal lengths, the most credible first.
+
+    A global mapper that placed a part of a long sequence places all images if the incremental one fails.
+    """
+    starts, candidates, is_settled = list(_starts(task).items()), [], False
+    for some in (starts[:2], starts[2:]):
+        if some and not is_settled:
+            candidates += _globally(some, task.placed, task)
+            right = [w for w in candidates if judge_alone(w, task.is_ordered).grade == "right"]
+            differences = [agreement(right[0], w) for w in right[1:]]
+            is_settled = bool(right) and all(d is not None and agrees(d) for d in differences)
+    focals, is_part, failed = {}, len(task.placed) < len(task.offered), None
+    if candidates and task.free.lens:
+        best = best_first(candidates, task.is_ordered)[0].model
+        focals = {n: c.mean_focal_length() for n, c in best.cameras.items()}
+    attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
+    try:
+        start = _start_from(task, "from-global", focals)
+        model, says = reconstruct(task, start, attempts)
+        candidates.append(witness_of("incremental", says, model, task.database, task.offered))
+    except InputError as error:
+        failed = error
+    large = [w for w in candidates if len(w.images) >= NEARLY_ALL * len(task.offered)]
+    if is_part and not any(judge_alone(w, task.is_ordered).grade == "right" for w in large):
+        candidates += _globally([("global-all", focals)], task.offered, task)
+    if failed and not candidates:
+        raise failed
+    return best_first(candidates, task.is_ordered)
+
+
+def _starts(task: Task) -> dict[str, dict[int, float]]:
+    """Focal lengths that the global mapper starts from, by name of the start and id of the camera: those of the
+    database if they are known, else guesses. The first guess is the focal length for which the fundamental matrices of
+    the pairs become essential ones, if they determine it (in a straight drive they do not). The others are fixed
+    multiples of the image side."""
+    with pycolmap.Database.open(task.database) as opened:
+        unknown = [c for c in opened.read_all_cameras() if not c.has_prior_focal_length]
+    if not task.free.lens or not unknown:
+        return {"global": {}}
+    guesses = {f"global-{ratio}": {c.camera_id: ratio * max(c.width, c.height) for c in unknown} for ratio in STARTS}
+    calibrated_database = task.work / "calibrated.db"
+    shutil.copyfile(task.database, calibrated_database)
+    options = pycolmap.ViewGraphCalibrationOptions()
+    options.random_seed = SEED
+    options.reestimate_relative_pose = False  # only the focal lengths are taken
     with quiet():
-        model = triangulate_points(model, database, images, threads, COARSE_PX if refines else FINE_PX)
-    share = model.compute_num_observations() / max(matched_keypoints(database, list(model.reg_image_ids())), 1)
-    if share < LEAST_SHARE:
-        raise PrepareError(
-            f"Only {share:.0%} of the matched keypoints become points from the given poses: the camera axes "
-            "(--poses-axes opencv or opengl), the order of the images, the direction (camera "
-            "to world is wanted) or the intrinsics (--focal, --camera) are not what the poses were made with."
-        )
-    error = model.compute_mean_reprojection_error()
-    says = f"points from known poses: {share:.0%} of the matched keypoints, {error:.2f} px"
-    if refines:
-        for _ in range(REFINE_ROUNDS):
-            adjust(model, threads, refine_lens, poses=refine_poses)
-            with quiet():
-                model = triangulate_points(model, database, images, threads, FINE_PX)
-        model.transform(similarity_between(camera_poses(model)[1], before))
-        _, after = camera_poses(model)
-        moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=-1)
-        turned = degrees_between(after[:, :3, :3], before[:, :3, :3])
-        says += (
-            f"; refined, {model.compute_mean_reprojection_error():.2f} px; poses moved by {moved.mean():.3g} units (at "
-            f"most {moved.max():.3g}) and turned by {turned.mean():.2f} degrees (at most {turned.max():.2f})"
-        )
-    say(says)
-    return model, says
+        pycolmap.calibrate_view_graph(calibrated_database, options)
+    with pycolmap.Database.open(calibrated_database) as opened:
+        calibrated = {c.camera_id: c.mean_focal_length() for c in opened.read_all_cameras()}
+    calibrated_database.unlink()
+    if all(abs(calibrated[n] / focal - 1) > NEAR for guess in guesses.values() for n, focal in guess.items()):
+        guesses = {"global-calibrated": {c.camera_id: calibrated[c.camera_id] for c in unknown}} | guesses
+    return guesses
+
+
+def _start_from(task: Task, name: str, focals: Mapping[int, float]) -> Path:
+    """A copy of the database whose cameras start with other focal lengths; the database itself where there are none."""
+    if not focals:
+        return task.database
+    database = task.work / f"{name}.db"
+    shutil.copyfile(task.database, database)
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            if camera.camera_id in focals:
+                params = camera.params.copy()
+                params[camera.focal_length_idxs()] = focals[camera.camera_id]
+                camera.params = params
+                opened.update_camera(camera)
+    return database
+
+
+def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[str], task: Task) -> list[Witness]:
+    """Runs the global mapper on some images from all starts in parallel on all cores; failed starts are left out."""
+    cores = task.threads if task.threads > 0 else os.cpu_count() or 1
+    workers = min(cores, len(starts))
+
+    def run(start: tuple[str, dict[int, float]]) -> pycolmap.Reconstruction | None:
+        model = map_globally(task, *start, names, max(1, cores // workers))
+        advance()
+        return model
+
+    with (
+        progress("Global mapping", len(starts)) as advance,
+        quiet(),  # outermost: each mapper's own would end before the other is done
+        ThreadPoolExecutor(workers) as pool,
+    ):
+        models = list(pool.map(run, starts))
+    candidates = []
+    for (name, _), model in zip(starts, models, strict=True):
+        if model is None:
+            say(f"Mapping, {name}: no model.")
+            continue
+        focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
+        error = model.compute_mean_reprojection_error()
+        says = f"{model.num_reg_images()} of {len(names)} images, {error:.2f} px, focal length {focal} px"
+        witness = witness_of("global", f"{name} ({says})", model, task.database, task.offered)
+        if share(witness.pairs.tracked, witness.pairs.matches) < LEAST_POINTS:
+            says += "; left out, as hardly any match became a point"
+        else:
+            candidates.append(witness)
+        say(f"Mapping, {name}: {says}.")
+    return candidates

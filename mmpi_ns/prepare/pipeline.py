@@ -2,35 +2,42 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pycolmap
+from filelock import FileLock, Timeout
 
 from mmpi_ns.capture.matching import new_model, rigid3d
 from mmpi_ns.capture.sfm import load_pycolmap
 from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images
-from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval
-from mmpi_ns.prepare.alignment import SceneFrame, camera_poses, choose_frame
-from mmpi_ns.prepare.images import Intrinsics, Photo, in_short, make_cameras, parse_camera, share
-from mmpi_ns.prepare.mappers import Solution, map_and_judge
-from mmpi_ns.prepare.mapping import Task, map_known_poses
+from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval, map_known_poses
+from mmpi_ns.prepare.alignment import camera_poses, choose_frame
+from mmpi_ns.prepare.images import Photo, in_short, make_cameras, parse_camera
+from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.poses import read_poses
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
-from mmpi_ns.prepare.stages import PrepareError, Stages, only_one
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.prepare.video import select_frames
-from mmpi_ns.utils.errors import progress, quoted, say
-from mmpi_ns.utils.files import whole
+from mmpi_ns.utils.errors import InputError, progress, quoted, say
+from mmpi_ns.utils.files import whole, write_text
 
-WORK = ".prepare"
+WORK, DATABASE = ".prepare", "database.db"
+FULL = (errno.ENOSPC, errno.EDQUOT)
+LEFT = 1 << 20
+"""Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 LEAST_IMAGES = 3
 """From which poses can be found; COLMAP's mappers make no smaller model."""
 LEAST_SHARE = 0.5
@@ -38,206 +45,211 @@ LEAST_SHARE = 0.5
 
 
 class Preparation:
-    """A run of mmpi-prepare; the work folder holds what an interrupted run left."""
+    """A run of mmpi-prepare in stages. The work folder holds what an interrupted run left, a folder for each stage.
+
+    A stage is valid while its own settings and those of all earlier ones are unchanged, and is skipped if it was
+    finished; the first that changed is emptied, and so are all after it. An interrupted stage finds its own partial
+    output again.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.work = settings.scene / WORK
         self.image_folder = self.work / "input" / "images"
         self.times: dict[str, float] = {}
-        self.stages = Stages(self.work)
+        self.key = ""
 
     def run(self) -> Verdict:
         """Input to scene; how far it can be believed."""
         s = self.settings
         with self._timed("reading"):
-            self._read_input()
-            self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
-            if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
-                raise PrepareError(
-                    f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
-                    "(better twenty), or give known poses (--poses)."
-                )
-            self._split([p.name for p in self.photos])  # refuse a split that is impossible before the work
-        self.is_fixed = self._set_cameras()
+            self._read()
         with self._timed("features"):
             source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
-            with self.stages.stage("features", source) as (folder, is_done):
-                database = folder / "database.db"
-                if not is_done:
-                    features.create_database(database, self.photos, self.numbers, self.cameras)
-                    features.extract(database, self.image_folder, self.photos, self.masks, s.max_features, s.threads)
+            folder, _ = self._stage("features", source, self._find_features)
         with self._timed("matching"):
-            database, self.matching = self._matches(database)
+            poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
+            source = [s.matching, s.overlap, poses]
+            folder, self.matching = self._stage("matches", source, partial(self._match, folder / DATABASE))
+            say(f"Matching: {self.matching}.")
         with self._timed("mapping"):
-            solution, self.focal, self.groups = self._solve(database)
-        count, total = solution.model.num_reg_images(), len(self.photos)
+            source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
+            folder, self.mapped = self._stage("model", source, partial(self._map, folder / DATABASE))
+        model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
+        count, total = model.num_reg_images(), len(self.photos)
         if count < LEAST_SHARE * total and not s.allow_partial:
-            groups = "".join(f" Another group of {len(g)}: {in_short(g, 4)}." for g in self.groups)
-            raise PrepareError(
-                f"Only {count} of {total} images could be registered: {in_short(camera_poses(solution.model)[0], 4)}."
+            groups = "".join(f" Another group of {len(g)}: {in_short(g)}." for g in self.mapped["groups"])
+            raise InputError(
+                f"Only {count} of {total} images could be registered: {in_short(camera_poses(model)[0])}."
                 f"{groups} The groups need images that connect them. For a scene of the {count} alone: "
                 "--allow-partial. What was found so far is kept, and a new run goes on from it."
             )
-        if solution.verdict.grade == "broken" and not s.allow_doubtful:
-            raise PrepareError(
-                f"The track that was found is wrong, so no scene was made. {solution.verdict.words()} {REMEDY} "
+        if verdict.grade == "broken" and not s.allow_doubtful:
+            raise InputError(
+                f"The track that was found is wrong, so no scene was made. {verdict.says} {REMEDY} "
                 "To look at it all the same: --allow-doubtful."
             )
-        with self._timed("writing"):
-            return self._write(solution)
+        return self._write(model, verdict)
+
+    def _stage(self, name: str, settings: Any, make: Callable[[Path], Any]) -> tuple[Path, Any]:
+        """A stage's own folder, and what the work on it returned, now or before.
+
+        Args:
+            name: the folder's name.
+            settings: everything the result depends on besides the earlier stages; JSON or text.
+            make: fills the folder, and returns JSON.
+        """
+        text = self.key + name + json.dumps(settings, sort_keys=True, default=str)
+        self.key = hashlib.sha256(text.encode()).hexdigest()
+        folder, stamp = self.work / name, self.work / f"{name}.json"
+        try:
+            state = json.loads(stamp.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            state = {}  # missing or truncated: the stage starts over
+        if state.get("key") != self.key:
+            shutil.rmtree(folder, ignore_errors=True)
+            write_text(stamp, json.dumps({"key": self.key}))
+        elif "result" in state:
+            say(f"{name}: done before", "dim")
+            return folder, state["result"]
+        folder.mkdir(exist_ok=True)
+        result = make(folder)
+        write_text(stamp, json.dumps({"key": self.key, "result": result}))
+        return folder, result
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
         start = time.monotonic()
         yield
-        self.times[name] = self.times.get(name, 0.0) + time.monotonic() - start
+        self.times[name] = time.monotonic() - start
 
-    def _read_input(self) -> None:
-        """The images, whether they come in the order of the motion, and the folder of their masks."""
+    def _read(self) -> None:
+        """Images, masks and known poses, whether the images come in the order of the motion, and their cameras."""
         s = self.settings
         self.is_video = s.input.is_file()
         if self.is_video and s.input.suffix.lower() not in images.VIDEOS:
-            raise PrepareError(f"{s.input} is neither a folder nor a video ({', '.join(images.VIDEOS)}).")
+            raise InputError(f"{s.input} is neither a folder nor a video ({', '.join(images.VIDEOS)}).")
         files = [s.input] if self.is_video else images.find_images(s.input)
         source = [(str(p), p.stat().st_size, p.stat().st_mtime) for p in files]
         source = [*source[0], s.max_frames, s.frame_motion] if self.is_video else source
-        with self.stages.stage("input", source) as (folder, is_done):
-            if self.is_video and not is_done:
-                select_frames(s.input, folder, s.max_frames, s.frame_motion)
-            elif not is_done:
-                images.gather(s.input, files, folder)
-        self.photos = images.read_photos(folder)
+
+        def read(folder: Path) -> list[dict[str, Any]]:
+            if self.is_video:
+                return [asdict(p) for p in select_frames(s.input, folder, s.max_frames, s.frame_motion)]
+            return [asdict(p) for p in images.gather(s.input, files, folder)]
+
+        self.photos = [Photo(**entry) for entry in self._stage("input", source, read)[1]]
         self.is_ordered = self.is_video or features.are_numbered([p.name for p in self.photos])
         self.masks = None
         if s.masks is not None:
             stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
-            with self.stages.stage("masks", stamps) as (self.masks, is_done):
-                if not is_done:
-                    images.gather_masks(s.masks, self.photos, self.masks)
+            self.masks, _ = self._stage("masks", stamps, partial(images.gather_masks, s.masks, self.photos))
+        self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
+        if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
+            raise InputError(
+                f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
+                "(better twenty), or give known poses (--poses)."
+            )
+        self._split([p.name for p in self.photos])  # refuse a split that is impossible before the work
+        self._set_cameras()
 
-    def _set_cameras(self) -> bool:
-        """Numbers and cameras of the images; returns whether their intrinsics are to be kept."""
+    def _set_cameras(self) -> None:
+        """Numbers and cameras of the images, and whether their intrinsics are to be kept."""
         s = self.settings
-        lenses: dict[str, Intrinsics] = dict(self.known_poses.intrinsics) if self.known_poses else {}
+        lenses = self.known_poses.intrinsics if self.known_poses else {}
         if s.camera is not None:
-            camera = parse_camera(s.camera, s.lens == "fisheye")
-            lenses = {p.name: camera for p in self.photos}
+            lenses = dict.fromkeys((p.name for p in self.photos), parse_camera(s.camera, s.lens == "fisheye"))
         elif s.focal is not None:
             lenses = {}
-        self.numbers = share(self.photos, s.intrinsics, lenses)
-        self.cameras = make_cameras(self.photos, self.numbers, lenses, s.focal, s.lens)
+        self.numbers, self.cameras = make_cameras(self.photos, s.intrinsics, lenses, s.focal, s.lens)
         is_given = bool(lenses) or s.focal is not None
         if self.known_poses is not None and not is_given and not all(p.exif_focal for p in self.photos):
-            raise PrepareError("Known poses need the intrinsics they were made with: give --focal or --camera.")
-        return (is_given or self.known_poses is not None) and not s.refine_intrinsics
+            raise InputError("Known poses need the intrinsics they were made with: give --focal or --camera.")
+        self.is_fixed = (is_given or self.known_poses is not None) and not s.refine_intrinsics
 
-    def _matches(self, database: Path) -> tuple[Path, str]:
-        """The database with verified matches, and what was matched in words."""
-        s = self.settings
-        poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
-        with self.stages.stage("matches", [s.matching, s.overlap, poses]) as (folder, is_done):
-            path = folder / "database.db"
-            if not is_done:
-                if not path.exists():
-                    with whole(path) as partial:
-                        shutil.copyfile(database, partial)
-                names = [p.name for p in self.photos]
-                if self.known_poses is not None and s.matching == "auto":
-                    places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
-                    poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
-                    listed = [(places[i], places[j]) for i, j in near_pairs(poses[:, :3], 2 * s.overlap)]
-                    says = f"the {2 * s.overlap} nearest by pose"
-                else:
-                    alike = features.image_similarity(path, len(names))
-                    chosen, why = features.choose(s.matching, names, alike, self.is_video)
-                    listed, says = features.list_pairs(chosen, alike, s.overlap), f"{chosen} ({why})"
-                    if chosen == "sequential":
-                        says += f", {len(features.revisits(alike, s.overlap))} pairs that may be revisits"
-                verified = features.match(path, self.photos, listed, s.threads)
-                (folder / "says.txt").write_text(f"{says}; {verified} of {len(listed)} pairs match", encoding="utf-8")
-        says = (folder / "says.txt").read_text(encoding="utf-8")
-        say(f"Matching: {says}.")
-        return path, says
+    def _find_features(self, folder: Path) -> None:
+        s, database = self.settings, folder / DATABASE
+        features.create_database(database, self.photos, self.numbers, self.cameras)
+        features.extract(database, self.image_folder, self.photos, self.masks, s.max_features, s.threads)
 
-    def _solve(self, database: Path) -> tuple[Solution, tuple[float, float] | None, list[list[str]]]:
-        """Poses and points; the interval of a refined focal length; connected groups of images without a pose."""
+    def _match(self, unmatched: Path, folder: Path) -> str:
+        """Makes the database with verified matches; what was matched in words."""
+        s, database, names = self.settings, folder / DATABASE, [p.name for p in self.photos]
+        if not database.exists():
+            with whole(database) as unfinished:
+                shutil.copyfile(unmatched, unfinished)
+        if self.known_poses is not None and s.matching == "auto":
+            places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
+            poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
+            pairs = [(places[i], places[j]) for i, j in near_pairs(poses[:, :3], 2 * s.overlap)]
+            says = f"the {2 * s.overlap} nearest by pose"
+        else:
+            alike = features.image_similarity(database, len(names))
+            pairs, says = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
+        verified = features.match(database, self.photos, pairs, s.threads)
+        return f"{says}; {verified} of {len(pairs)} pairs match"
+
+    def _map(self, database: Path, folder: Path) -> dict[str, Any]:
+        """Makes the model; how, the verdict, the interval of a refined focal length, and connected groups of images
+        without a pose."""
         s, names = self.settings, [p.name for p in self.photos]
-        source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
-        with self.stages.stage("model", source) as (folder, is_done):
-            if not is_done:
-                groups: list[list[str]] = []
-                if self.known_poses is not None:
-                    poses = {n: rigid3d(p) for n, p in self.known_poses.poses.items()}
-                    model = new_model(self.cameras, names, self.numbers, poses)
-                    refine = not self.is_fixed and s.refine_intrinsics
-                    model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
-                    solution = Solution(model, f"{self.known_poses.says}; {says}")
-                else:
-                    lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
-                    free = Free(lens, lens and s.lens == "auto", principal_point=place)
-                    is_sequence = self.matching.startswith("sequential")
-                    solution = map_and_judge(
-                        Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)
-                    )
-                    lost = sorted(set(range(len(names))) - {i - 1 for i in solution.model.reg_image_ids()})
-                    groups = [[names[i] for i in group] for group in features.connected(database, lost)]
-                (folder / "model").mkdir(exist_ok=True)
-                solution.model.write(folder / "model")
-                focal = None
-                if not self.is_fixed:
-                    with progress("Checking the focal length", 1) as advance:
-                        focal = focal_interval(solution.model, s.threads)
-                        advance()
-                says = {"mapping": solution.says, "groups": groups, "focal": focal}
-                says |= {"grade": solution.verdict.grade, "reasons": solution.verdict.reasons}
-                (folder / "says.json").write_text(json.dumps(says), encoding="utf-8")
-        says = json.loads((folder / "says.json").read_text(encoding="utf-8"))
-        verdict = Verdict(says["grade"], tuple(says["reasons"]))
-        solution = Solution(pycolmap.Reconstruction(folder / "model"), says["mapping"], verdict)
-        return solution, says["focal"], says["groups"]
+        verdict, groups, focal = Verdict("right"), [], None
+        if self.known_poses is not None:
+            poses = {n: rigid3d(p) for n, p in self.known_poses.poses.items()}
+            model = new_model(self.cameras, names, self.numbers, poses)
+            refine = not self.is_fixed and s.refine_intrinsics
+            model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
+            says = f"{self.known_poses.says}; {says}"
+        else:
+            lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
+            free = Free(lens, lens and s.lens == "auto", principal_point=place)
+            is_sequence = self.matching.startswith("sequential")
+            model, says, verdict = map_and_judge(
+                Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)
+            )
+            lost = sorted(set(range(1, len(names) + 1)) - set(model.reg_image_ids()))
+            groups = [[names[i - 1] for i in group] for group in features.connected(database, lost)]
+        (folder / "model").mkdir(exist_ok=True)
+        model.write(folder / "model")
+        if not self.is_fixed:
+            with progress("Checking the focal length", 1) as advance:
+                focal = focal_interval(model, s.threads)
+                advance()
+        return {"says": says, "verdict": asdict(verdict), "focal": focal, "groups": groups}
 
-    def _write(self, solution: Solution) -> Verdict:
+    def _write(self, model: pycolmap.Reconstruction, verdict: Verdict) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
-        s, model, verdict = self.settings, solution.model, solution.verdict
-        frame = SceneFrame(pycolmap.Sim3d(), "that of the given poses", "that of the given poses")
+        s, says = self.settings, self.mapped["says"]
+        up = unit = "that of the given poses"
         if self.known_poses is None or s.camera_height is not None:
-            frame = choose_frame(model, s.camera_height)
-            model.transform(frame.similarity)
+            similarity, up, unit = choose_frame(model, s.camera_height)
+            model.transform(similarity)
         names = set(camera_poses(model)[0])
         photos = [p for p in self.photos if p.name in names]
         split = self._split([p.name for p in photos])
-        findings = self._findings(model, photos)
-        folder, masks, flat, built = self.image_folder, self.masks, self.work / "undistorted", self.work / "scene"
+        folder, flat, built = self.image_folder, self.work / "undistorted", self.work / "scene"
         shutil.rmtree(flat, ignore_errors=True)
         shutil.rmtree(built, ignore_errors=True)
-        says = "masks given" if masks else "not looked for"
-        if s.moving != "keep" and masks is None:
-            moves, says = self._look_for_moving(model, photos, split)
-            if s.moving == "mask":
-                masks = self.work / "moving" if moves else None
-            else:
-                words = "of the image moves: mask it (--moving mask, or --masks)"
-                findings += [checks.Finding("moving?", name, f"{x:.0%} {words}", x) for name, x in moves.items()]
+        findings, masks, moves = self._check(model, photos, split, built)
         grave = [f"{f.says[:1].upper()}{f.says[1:]}." for f in findings if f.is_grave]
         if grave and self.known_poses is None and verdict.grade == "right":
-            verdict = Verdict("doubtful", tuple(grave))
+            verdict = Verdict("doubtful", " ".join(grave))
         if s.undistort:
             model, photos = export.undistort(model, photos, folder, masks, flat, s.threads)
             folder, masks = flat / "images", flat / "masks" if masks else None
         export.write_images(folder, masks, photos, built, s.downscales)
-        notes = {"unit": frame.unit, "up": frame.up, "mapping": solution.says, "matching": self.matching}
+        notes = {"unit": unit, "up": up, "mapping": says, "matching": self.matching}
         export.write_scene(model, built, export.transforms(model, split, masks is not None, notes))
         rows = {
             "images registered": f"{len(photos)} of {len(self.photos)}",
             "matching": self.matching,
-            "mapping": solution.says,
-            "verdict": f"{verdict.grade} {verdict.words()}".strip(),
-            "focal length": "given" if self.focal is None else focal_in_words(*self.focal),
+            "mapping": says,
+            "verdict": f"{verdict.grade} {verdict.says}".strip(),
+            "focal length": focal_in_words(*self.mapped["focal"]) if self.mapped["focal"] else "given",
             "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
-            "what moves": says,
-            "up": frame.up,
-            "unit": frame.unit,
+            "what moves": moves,
+            "up": up,
+            "unit": unit,
             "split": f"{len(split.train)} train, {len(split.test)} test: {split.says}",
             "times": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.times.items()),
         }
@@ -250,29 +262,11 @@ class Preparation:
 
     def _left_out(self, registered: set[str]) -> list[str]:
         """Sentences on the images without a pose."""
-        grouped = {name for group in self.groups for name in group}
-        lost = [p.name for p in self.photos if p.name not in registered | grouped]
+        groups = self.mapped["groups"]
+        lost = [p.name for p in self.photos if p.name not in registered.union(*groups)]
         apart = "images form a group of their own, not connected to the scene"
         sentences = [f"{len(lost)} images have no pose and are left out: {in_short(lost, 8)}"] if lost else []
-        return sentences + [f"{len(group)} {apart}: {in_short(group, 8)}" for group in self.groups]
-
-    def _look_for_moving(
-        self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split
-    ) -> tuple[dict[str, float], str]:
-        """Masks of what moves; their share of each image that has any, and a sentence."""
-        from mmpi_ns.prepare.moving import write_masks  # imports nerfstudio, which takes seconds
-
-        picture = self.work / "scene" / "report" / "moving.jpg"
-        moves = write_masks(
-            model, photos, split.train, self.image_folder, self.work / "moving", picture, self.settings.threads
-        )
-        if not moves:
-            return {}, "nothing is seen to move"
-        share = sum(moves.values()) / len(split.train)
-        fate = "are masked" if self.settings.moving == "mask" else "move"
-        says = f"{share:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
-        say(f"What moves: {says}; report/moving.jpg shows them.")
-        return moves, says
+        return sentences + [f"{len(group)} {apart}: {in_short(group, 8)}" for group in groups]
 
     def _split(self, names: Sequence[str]) -> export.Split:
         s = self.settings
@@ -282,14 +276,17 @@ class Preparation:
             return export.split_from(self.known_poses.split, names, f"{s.poses}")
         return export.split_by_count(names, s.test_every, s.train_every)
 
-    def _findings(self, model: pycolmap.Reconstruction, photos: Sequence[Photo]) -> list[checks.Finding]:
-        names, sharp = [p.name for p in photos], np.zeros(len(photos))
-        findings = checks.doubtful_intrinsics(model, self.is_fixed, self.focal, self.settings.threads)
+    def _check(
+        self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split, built: Path
+    ) -> tuple[list[checks.Finding], Path | None, str]:
+        """Findings on the scene to be built; the folder of its masks, given or of what moves; what moves in words."""
+        s, names, sharp = self.settings, [p.name for p in photos], np.zeros(len(photos))
+        findings = checks.doubtful_intrinsics(model, self.is_fixed, self.mapped["focal"], s.threads)
         with progress("Checking images", len(names)) as advance:
             for i, name in enumerate(names):
                 gray = cv2.imread(str(self.image_folder / name), cv2.IMREAD_GRAYSCALE)
                 if gray is None:
-                    raise PrepareError(f"{name} cannot be read: repair or remove it.")
+                    raise InputError(f"{name} cannot be read: repair or remove it.")
                 sharp[i] = checks.sharpness(gray)  # type: ignore[arg-type]
                 advance(1)
         findings += checks.blurred(names, sharp, self.is_ordered)
@@ -297,7 +294,21 @@ class Preparation:
             order, poses = camera_poses(model)
             offered = [p.name for p in self.photos]
             findings += checks.misplaced(order, [offered.index(n) for n in order], poses)
-        return findings
+        if s.moving == "keep" or self.masks is not None:
+            return findings, self.masks, "masks given" if self.masks else "not looked for"
+        from mmpi_ns.prepare.moving import write_masks  # imports nerfstudio, which takes seconds
+
+        target, picture = self.work / "moving", built / "report" / "moving.jpg"
+        moves = write_masks(model, photos, split.train, self.image_folder, target, picture, s.threads)
+        if not moves:
+            return findings, None, "nothing is seen to move"
+        moving, fate = sum(moves.values()) / len(split.train), "are masked" if s.moving == "mask" else "move"
+        says = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
+        say(f"What moves: {says}; report/moving.jpg shows them.")
+        if s.moving == "mask":
+            return findings, target, says
+        words = "of the image moves: mask it (--moving mask, or --masks)"
+        return [*findings, *(checks.Finding("moving?", n, f"{x:.0%} {words}", x) for n, x in moves.items())], None, says
 
     def _publish(
         self,
@@ -318,7 +329,7 @@ class Preparation:
             say(line, "yellow")
         is_right = verdict.grade == "right"
         if not is_right:
-            say(f"This scene is {verdict.grade}: {verdict.words()} {REMEDY}", "bold red")
+            say(f"This scene is {verdict.grade}: {verdict.says} {REMEDY}", "bold red")
         say(
             f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
             f"{len(split.train)} train, {len(split.test)} test; checks.md says more. Train with:",
@@ -327,21 +338,40 @@ class Preparation:
         say(f"ns-train mmpi-small --data {quoted(scene)}")
 
 
+@contextmanager
+def only_one(work: Path) -> Iterator[None]:
+    """Locks a work folder against a second run. Raises InputError if one is at work there, or the disk is full."""
+    work.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(work / "lock", blocking=False):
+            yield
+    except Timeout as error:
+        raise InputError(f"Another mmpi-prepare is making {work.parent}: wait for it, or name another.") from error
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError) as error:
+        free = shutil.disk_usage(work.parent).free
+        if getattr(error, "errno", None) in FULL or free < LEFT:
+            says = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
+            raise InputError(says) from error
+        raise
+
+
 def prepare(settings: Settings) -> Verdict:
-    """Makes the scene; returns how far it can be believed. Raises PrepareError if the input is missing or cannot be
+    """Makes the scene; returns how far it can be believed. Raises InputError if the input is missing or cannot be
     made into a scene, or something would be lost in its folder."""
     load_pycolmap()  # in a version that is new enough
     check_options(settings)
     source, scene = settings.input.resolve(), settings.scene.resolve()
     if not source.exists():
-        raise PrepareError(f"{settings.input} does not exist.")
+        raise InputError(f"{settings.input} does not exist.")
     if settings.scene.is_file():
-        raise PrepareError(f"{settings.scene} is a file: name a folder for the scene.")
+        raise InputError(f"{settings.scene} is a file: name a folder for the scene.")
     taken = export.existing_parts(scene)
     if scene == source or source in scene.parents or any((scene / part) in (source, *source.parents) for part in taken):
-        raise PrepareError(f"The scene {settings.scene} would be mixed with its input: name another folder.")
+        raise InputError(f"The scene {settings.scene} would be mixed with its input: name another folder.")
     if taken and not settings.overwrite:
-        raise PrepareError(
+        raise InputError(
             f"{settings.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite "
             "(the old files are then moved aside)."
         )

@@ -14,8 +14,7 @@ import pycolmap
 
 from mmpi_ns.prepare.alignment import Array, nearest_rotation
 from mmpi_ns.prepare.images import IMAGES, Intrinsics, Photo, natural_key
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import say
+from mmpi_ns.utils.errors import InputError, say
 
 MAX_LAG = 0.05
 """Maximum time in seconds between an image and its pose."""
@@ -45,7 +44,7 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
         photos: the images.
 
     Raises:
-        PrepareError: the file is not understood, or fits fewer than two images.
+        InputError: the file is not understood, or fits fewer than two images.
     """
     is_transforms = path.suffix.lower() == ".json"
     if path.is_dir() or is_transforms:
@@ -59,12 +58,10 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
     for name, pose in poses.items():
         stretch = np.linalg.svd(pose[:3, :3])[1]
         if np.abs(stretch - 1).max() > 0.02 or np.linalg.det(pose[:3, :3]) < 0:
-            raise PrepareError(
-                f"The pose of {name} is no rotation and translation (singular values {stretch.round(3)})."
-            )
+            raise InputError(f"The pose of {name} is no rotation and translation (singular values {stretch.round(3)}).")
         pose[:3, :3] = nearest_rotation(pose[:3, :3])
     if len(poses) < 2:
-        raise PrepareError(f"--poses {path} has finite poses for {len(poses)} images: at least two are needed.")
+        raise InputError(f"--poses {path} has finite poses for {len(poses)} images: at least two are needed.")
     if len(poses) < len(photos):
         say(f"{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.", "yellow")
     return replace(read, poses=poses)
@@ -77,16 +74,16 @@ def _read_rows(path: Path) -> Array:
     width, rows = len(next(filter(None, lines), [])), []
     if width not in (8, 12):
         formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
-        raise PrepareError(f"--poses {path} is not understood: {formats}.")
+        raise InputError(f"--poses {path} is not understood: {formats}.")
     for number, fields in enumerate(lines, 1):
         if not fields:
             continue
         try:
             rows.append([float(f) for f in fields])
         except ValueError as error:
-            raise PrepareError(f"{path}, line {number}: {error}.") from error
+            raise InputError(f"{path}, line {number}: {error}.") from error
         if len(fields) != width:
-            raise PrepareError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
+            raise InputError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
     return np.array(rows, dtype=np.float64)
 
 
@@ -99,7 +96,7 @@ def _read_kitti(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
         digits = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
         places = [int(d[-1]) for d in digits if d]
         if len(rows) < len(photos) or len(set(places)) < len(photos) or max(places) >= len(rows):
-            raise PrepareError(f"{path} has {len(rows)} poses for {len(photos)} images: they cannot be matched.")
+            raise InputError(f"{path} has {len(rows)} poses for {len(photos)} images: they cannot be matched.")
         says = "KITTI poses, the lines that the images' numbers name (from 0)"
     return KnownPoses({p.name: matrices[i] for p, i in zip(photos, places, strict=True)}, says)
 
@@ -120,7 +117,7 @@ def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
     if 2 * len(matched) >= len(photos):
         return KnownPoses(matched, f"TUM poses, matched by time stamp within {MAX_LAG} s")
     if len(rows) != len(photos):
-        raise PrepareError(
+        raise InputError(
             f"{path} has {len(rows)} poses for {len(photos)} images, and the images' names are not their time stamps."
         )
     return KnownPoses(
@@ -130,15 +127,14 @@ def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """4x4 matrices: one text file for each image, by name, else in order."""
-    files = sorted(
-        (p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")), key=lambda p: natural_key(p.name)
-    )
+    files = [p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")]
+    files.sort(key=lambda p: natural_key(p.name))
     by_stem = {_pose_stem(p): p for p in files if p.is_file()}
-    chosen = {p.name: by_stem[s] for p in photos for s in (_pose_stem(Path(p.source)),) if s in by_stem}
+    chosen = {p.name: by_stem[stem] for p in photos if (stem := _pose_stem(Path(p.source))) in by_stem}
     says = "4x4 matrices, by name"
     if len(chosen) < 2:
         if len(files) != len(photos):
-            raise PrepareError(f"{path} has {len(files)} files for {len(photos)} images, and the names do not match.")
+            raise InputError(f"{path} has {len(files)} files for {len(photos)} images, and the names do not match.")
         chosen, says = {p.name: f for p, f in zip(photos, files, strict=True)}, "4x4 matrices, in order"
     _check_apart(chosen, path)
     poses = {}
@@ -146,9 +142,9 @@ def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         try:
             matrix = np.loadtxt(file, dtype=np.float64)
         except ValueError as error:
-            raise PrepareError(f"{file} cannot be read ({error}).") from error
+            raise InputError(f"{file} cannot be read ({error}).") from error
         if matrix.shape not in ((4, 4), (3, 4)):
-            raise PrepareError(f"{file} is {matrix.shape}, not 4x4.")
+            raise InputError(f"{file} is {matrix.shape}, not 4x4.")
         poses[name] = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
     return KnownPoses(poses, says)
 
@@ -175,13 +171,13 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
                 keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
                 sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)
                 if abs(sx / sy - 1) > 0.02:
-                    raise PrepareError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
+                    raise InputError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
                 fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
                 cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
                 lens = tuple(float(frame.get(k, 0.0)) for k in keys)
                 intrinsics[photo.name] = Intrinsics(fx * sx, fy * sy, cx * sx, cy * sy, lens, fisheye)  # type: ignore[arg-type]
     except (ValueError, KeyError, TypeError) as error:
-        raise PrepareError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
+        raise InputError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
     split = meta if "train_filenames" in meta and "test_filenames" in meta else None
     return KnownPoses(poses, "poses of a transforms.json, by name", intrinsics, split)
 
@@ -198,11 +194,11 @@ def _frame_of(photo: Photo, files: Sequence[Path]) -> int | None:
 
 
 def _check_apart(poses: dict[str, Any], path: Path) -> None:
-    """Raises PrepareError if two images were given the same pose, as images of two folders may have the same name."""
+    """Raises InputError if two images were given the same pose, as images of two folders may have the same name."""
     first: dict[Any, str] = {}
     for name, pose in poses.items():
         if pose in first:
-            raise PrepareError(
+            raise InputError(
                 f"{path} has one pose for {first[pose]} and {name}: images of one name in two folders need two."
             )
         first[pose] = name

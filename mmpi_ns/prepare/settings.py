@@ -12,7 +12,7 @@ import tyro
 
 from mmpi_ns.prepare.features import Matching
 from mmpi_ns.prepare.images import Lens, Sharing
-from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Settings:
 
 
 def check_options(s: Settings) -> None:
-    """Checks the options before any work. Raises PrepareError if one is out of range, contradicts another, or names no
+    """Checks the options before any work. Raises InputError if one is out of range, contradicts another, or names no
     file."""
     numbers = {
         "--focal": s.focal, "--camera-height": s.camera_height, "--frame-motion": s.frame_motion,
@@ -90,38 +90,38 @@ def check_options(s: Settings) -> None:
     }  # fmt: skip
     for option, value in numbers.items():
         if value is not None and not 0 < value < float("inf"):
-            raise PrepareError(f"{option} must be a positive number, not {value}.")
+            raise InputError(f"{option} must be a positive number, not {value}.")
     if s.camera is not None and not all(map(isfinite, s.camera)):
-        raise PrepareError(f"--camera takes finite numbers, not {s.camera}.")
+        raise InputError(f"--camera takes finite numbers, not {s.camera}.")
     if s.focal is not None and s.camera is not None:
-        raise PrepareError("--focal and --camera both give a focal length: leave one out.")
+        raise InputError("--focal and --camera both give a focal length: leave one out.")
     if s.test_every is not None and s.train_every is not None:
-        raise PrepareError("--test-every and --train-every contradict each other: leave one out.")
+        raise InputError("--test-every and --train-every contradict each other: leave one out.")
     for option, value in (("--test-every", s.test_every or None), ("--train-every", s.train_every)):
         if value is not None and value < 2:
-            raise PrepareError(f"{option} takes 2 or more, not {value} (--test-every 0: all images train and test).")
+            raise InputError(f"{option} takes 2 or more, not {value} (--test-every 0: all images train and test).")
     if s.max_frames < 2:
-        raise PrepareError(f"--max-frames {s.max_frames}: a scene needs at least two views.")
+        raise InputError(f"--max-frames {s.max_frames}: a scene needs at least two views.")
     if any(f < 2 for f in s.downscales) or len(set(s.downscales)) < len(s.downscales):
-        raise PrepareError(f"--downscales takes different whole numbers from 2 on, not {s.downscales}.")
+        raise InputError(f"--downscales takes different whole numbers from 2 on, not {s.downscales}.")
     if s.threads < 1 and s.threads != -1:
-        raise PrepareError(f"--threads takes a number of threads, or -1 for all cores, not {s.threads}.")
+        raise InputError(f"--threads takes a number of threads, or -1 for all cores, not {s.threads}.")
     if s.refine_poses and s.poses is None:
-        raise PrepareError("--refine-poses refines known poses: give them with --poses.")
+        raise InputError("--refine-poses refines known poses: give them with --poses.")
     if s.poses is not None and not s.poses.exists():
-        raise PrepareError(f"--poses {s.poses} does not exist.")
+        raise InputError(f"--poses {s.poses} does not exist.")
     if s.masks is not None and not s.masks.is_dir():
-        raise PrepareError(f"--masks {s.masks} is no folder.")
+        raise InputError(f"--masks {s.masks} is no folder.")
     if s.split_from is not None:
         read_lists(s.split_from)
 
 
 def read_lists(path: Path) -> dict[str, list[str]]:
-    """The train and test files that a JSON file lists. Raises PrepareError if it cannot be read, or lists none."""
+    """The train and test files that a JSON file lists. Raises InputError if it cannot be read, or lists none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return {key: [str(n) for n in content[key]] for key in ("train_filenames", "test_filenames")}
     except (OSError, ValueError) as error:
-        raise PrepareError(f"--split-from {path} cannot be read ({error}).") from error
+        raise InputError(f"--split-from {path} cannot be read ({error}).") from error
     except (KeyError, TypeError) as error:
-        raise PrepareError(f"--split-from {path} needs train_filenames and test_filenames.") from error
+        raise InputError(f"--split-from {path} needs train_filenames and test_filenames.") from error

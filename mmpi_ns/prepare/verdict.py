@@ -10,16 +10,15 @@ from typing import Literal
 import numpy as np
 
 from mmpi_ns.prepare.evidence import (
+    FEW,
     Agreement,
     Array,
     Witness,
     agreement,
     bridges,
-    held_by_image,
     held_by_side,
-    jumps,
     share,
-    speed_changes,
+    strides,
 )
 from mmpi_ns.prepare.images import in_short
 
@@ -70,11 +69,8 @@ class Verdict:
     """The verdict on a model."""
 
     grade: Grade
-    reasons: tuple[str, ...] = ()
-    """Sentences, the most severe first; none if it is right."""
-
-    def words(self) -> str:
-        return " ".join(self.reasons)
+    says: str = ""
+    """Why, in sentences, the most severe first; empty if it is right."""
 
 
 def worse(value: float, limits: tuple[float, float]) -> Grade:
@@ -98,12 +94,13 @@ def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
     if is_sequence:
         problems += _problems_along(witness)
     else:
-        held = held_by_image(pairs, count)
-        loose = [witness.images[int(i)] for i in np.flatnonzero(held < LOOSE)]
+        ends = np.concatenate([pairs.first, pairs.second])
+        held, matches = (np.bincount(ends, np.tile(x, 2), count) for x in (pairs.tracked, pairs.matches))
+        loose = [witness.images[int(i)] for i in np.flatnonzero((matches >= FEW) & (held < LOOSE * matches))]
         grade: Grade = "broken" if len(loose) > 0.1 * count else "doubtful" if loose else "right"
-        problems.append((grade, f"Most matches of {in_short(loose, 4)} contradict their poses."))
+        problems.append((grade, f"Most matches of {in_short(loose)} contradict their poses."))
     severe = sorted((p for p in problems if p[0] != "right"), key=lambda p: -ORDER.index(p[0]))
-    return Verdict(severe[0][0], tuple(says for _, says in severe)) if severe else Verdict("right")
+    return Verdict(severe[0][0], " ".join(says for _, says in severe)) if severe else Verdict("right")
 
 
 def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
@@ -150,13 +147,14 @@ def _leaps(witness: Witness, across: Array, between: Sequence[str]) -> list[tupl
         grade: Grade = "right" if change < SCALE[0] else "doubtful" if change < SCALE[1] else "broken"
         problems.append((grade, f"The scale changes by {np.expm1(change):.0%} {between[at]}."))
     is_weak = across < WEAK * float(np.nanmedian(across))
-    leaps = np.where(is_weak, jumps(witness), 0.0)
+    jumps, changes = strides(witness)
+    leaps = np.where(is_weak, jumps, 0.0)
     if leaps.max(initial=0.0) > JUMP:
         at = int(leaps.argmax())
         says = f"{between[at]}, {leaps[at]:.0f} usual steps, and few matches across it hold."
         problems.append(("broken", f"The track jumps {says}"))
     beside_weak = np.append(is_weak, False) | np.append(False, is_weak)
-    changes = np.where(beside_weak, speed_changes(witness), 1.0)
+    changes = np.where(beside_weak, changes, 1.0)
     if changes.max(initial=1.0) > CHANGE:
         at = int(changes.argmax())
         says = f"{changes[at]:.1f} times at {witness.images[at]}"
@@ -201,7 +199,7 @@ def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool
         f"({difference.centers.max():.1%} at most; most at {', '.join(worst)}), with focal lengths of "
         f"{chosen.focal:.2f} and {other.focal:.2f} image sides."
     )
-    return Verdict("doubtful", (*alone.reasons, says))
+    return Verdict("doubtful", f"{alone.says} {says}".strip())
 
 
 def _fit(witness: Witness) -> float:
@@ -209,20 +207,19 @@ def _fit(witness: Witness) -> float:
     return round(share(witness.pairs.fitting, witness.pairs.matches), 2)
 
 
-def best_first(witnesses: Sequence[Witness], is_sequence: bool) -> list[int]:
-    """Numbers of the witnesses, the most credible first.
+def best_first(witnesses: Sequence[Witness], is_sequence: bool) -> list[Witness]:
+    """The witnesses, the most credible first.
 
     Broken ones are last, and those with clearly fewer images than another come after it: a small part of the capture
     is seldom wrong. Then by verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by
     matches that became points. (A bent track may have more points than a right one: its points fit its bends.)
     """
-    grades = [judge_alone(w, is_sequence).grade for w in witnesses]
-    most = max((len(w.images) for w, grade in zip(witnesses, grades, strict=True) if grade != "broken"), default=0)
+    graded: list[tuple[Grade, Witness]] = [(judge_alone(witness, is_sequence).grade, witness) for witness in witnesses]
+    most = max((len(witness.images) for grade, witness in graded if grade != "broken"), default=0)
 
-    def key(number: int) -> tuple[bool, bool, int, int, float, float]:
-        witness, grade = witnesses[number], grades[number]
-        size = len(witness.images)
-        tracked = float(witness.pairs.tracked.sum())
+    def key(pair: tuple[Grade, Witness]) -> tuple[bool, bool, int, int, float, float]:
+        grade, witness = pair
+        size, tracked = len(witness.images), float(witness.pairs.tracked.sum())
         return grade != "broken", size >= NEARLY_ALL * most, -ORDER.index(grade), size, _fit(witness), tracked
 
-    return sorted(range(len(witnesses)), key=key, reverse=True)
+    return [witness for _, witness in sorted(graded, key=key, reverse=True)]

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.prepare.checks import sharpness
-from mmpi_ns.prepare.images import Photo, write_photos
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import progress, say
+from mmpi_ns.prepare.images import Photo
+from mmpi_ns.utils.errors import InputError, progress, say
 from mmpi_ns.utils.files import whole, write_text
 
 TRACK_WIDTH = 320
@@ -27,7 +26,7 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     """Writes the chosen frames of a video to ``target/images``.
 
     Raises:
-        PrepareError: the video cannot be read, or shows no motion.
+        InputError: the video cannot be read, or shows no motion.
     """
     (target / "images").mkdir(parents=True, exist_ok=True)
     log = target / "measured.json"
@@ -37,7 +36,7 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     chosen, used = choose_frames(motion, sharp, max_frames, step)
     frames = len(motion)
     if len(chosen) < 2:
-        raise PrepareError(f"{video} shows no motion in {frames} frames: there is no second view.")
+        raise InputError(f"{video} shows no motion in {frames} frames: there is no second view.")
     say(f"{len(chosen)} of {frames} frames taken: the sharpest for every {used:.1%} of the width of motion.")
     if used > MOST_MOTION:
         remedy = f"raise --max-frames above {max_frames} or cut the video into shorter ones"
@@ -47,7 +46,7 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     with progress("Writing frames", len(chosen)) as advance:
         for index in range(chosen[-1] + 1):
             if not capture.grab():
-                raise PrepareError(f"{video} could be read to frame {index - 1} this time: it changed, or is damaged.")
+                raise InputError(f"{video} could be read to frame {index - 1} this time: it changed, or is damaged.")
             if index != chosen[len(photos)]:
                 continue
             _, frame = capture.retrieve()
@@ -56,13 +55,12 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
             if not path.exists():
                 is_encoded, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
                 if not is_encoded:
-                    raise PrepareError(f"Frame {index} of {video} cannot be written.")
+                    raise InputError(f"Frame {index} of {video} cannot be written.")
                 with whole(path) as partial:
                     partial.write_bytes(data.tobytes())
             photos.append(Photo(name, frame.shape[1], frame.shape[0], source=name))
             advance(1)
     capture.release()
-    write_photos(photos, target)
     return photos
 
 
@@ -70,7 +68,7 @@ def measure(video: Path) -> tuple[list[float], list[float]]:
     """First pass, with two small frames in memory: motion of each since the one before over the width, and sharpness.
 
     Raises:
-        PrepareError: the video cannot be read.
+        InputError: the video cannot be read.
     """
     capture, total = _open(video)
     motion, sharp = [], []
@@ -89,7 +87,7 @@ def measure(video: Path) -> tuple[list[float], list[float]]:
             advance(1)
     capture.release()
     if not motion:
-        raise PrepareError(f"{video} holds no frame that can be read: it is damaged, or its codec is unknown here.")
+        raise InputError(f"{video} holds no frame that can be read: it is damaged, or its codec is unknown here.")
     if total and len(motion) < 0.9 * total:
         say(f"{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.", "yellow")
     return motion, sharp
@@ -98,7 +96,7 @@ def measure(video: Path) -> tuple[list[float], list[float]]:
 def _open(video: Path) -> tuple[cv2.VideoCapture, int]:
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
-        raise PrepareError(f"{video} cannot be opened as a video: it is damaged, or its codec is unknown here.")
+        raise InputError(f"{video} cannot be opened as a video: it is damaged, or its codec is unknown here.")
     return capture, max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
 
 

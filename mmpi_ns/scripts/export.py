@@ -29,6 +29,25 @@ class _Run:
     overwrite: bool = False
     """Replace an existing export."""
 
+    def check_paths(self, output: Path, is_file: bool = False) -> None:
+        """Raises ValueError if there is no run, it has no checkpoint, or there is something that an export would not
+        replace."""
+        if not self.load_config.is_file():
+            raise ValueError(f"There is no run at {self.load_config}: give the config.yml that ns-train wrote.")
+        folder = self.load_config.parent / "nerfstudio_models"
+        if not any(folder.glob("step-*.ckpt")):
+            raise ValueError(f"The run has no checkpoint in {folder}: train it at least until its first checkpoint.")
+        if is_file:
+            if output.exists() and not self.overwrite:
+                raise ValueError(f"{output} is there already: name another file, or give --overwrite.")
+        elif output.exists() and not output.is_dir():
+            raise ValueError(f"{output} is a file: name a folder to write.")
+        elif output.is_dir() and any(output.iterdir()):
+            if not (output / "scene.json").is_file():
+                raise ValueError(f"{output} holds other files: name an empty folder, or one that does not exist.")
+            if not self.overwrite:
+                raise ValueError(f"{output} holds an export already: name another folder, or give --overwrite.")
+
     def bake(self) -> BakedScene:
         """Bakes the run's scene and prints the loss of quality."""
         check_options(self, {"least": Number(0, 1), "compare": Number(0, whole=True)}, "--")
@@ -50,9 +69,8 @@ class Bake(_Run):
     """Folder to write (default: 'baked' beside config.yml)."""
 
     def main(self) -> None:
-        _check_run(self.load_config)
         folder = self.output or self.load_config.parent / "baked"
-        _check_output(folder, self.overwrite)
+        self.check_paths(folder)
         scene = self.bake()
         from mmpi_ns.export.files import write_baked
 
@@ -70,12 +88,8 @@ class Web(_Run):
     """One HTML file that opens by a double click."""
 
     def main(self) -> None:
-        _check_run(self.load_config)
         path = self.output if self.output.suffix == ".html" or not self.single_file else self.output / "index.html"
-        if not self.single_file:
-            _check_output(self.output, self.overwrite)
-        elif path.exists() and not self.overwrite:
-            raise ValueError(f"{path} is there already: name another file, or give --overwrite.")
+        self.check_paths(path, is_file=self.single_file)
         scene = self.bake()
         from mmpi_ns.export.files import write_baked
         from mmpi_ns.export.web import write_page, write_single_file
@@ -105,9 +119,7 @@ class Splats(_Run):
     """Maximum number of splats of a window."""
 
     def main(self) -> None:
-        _check_run(self.load_config)
-        if self.output.exists() and not self.overwrite:
-            raise ValueError(f"{self.output} is there already: name another file, or give --overwrite.")
+        self.check_paths(self.output, is_file=True)
         from mmpi_ns.ops import dispatch
 
         if dispatch.fault("C++") is not None:
@@ -120,27 +132,6 @@ class Splats(_Run):
             splats = splats_of(window, poses_in(place, scene), self.weight, self.most)
             size = write_ply(splats, path)
             print(f"Wrote {path}: {len(splats.means)} splats, {size / 1e6:.1f} MB.")
-
-
-def _check_run(load_config: Path) -> None:
-    """Raises ValueError if there is no run, or it has no checkpoint."""
-    if not load_config.is_file():
-        raise ValueError(f"There is no run at {load_config}: give the config.yml that ns-train wrote.")
-    checkpoints = load_config.parent / "nerfstudio_models"
-    if not any(checkpoints.glob("step-*.ckpt")):
-        raise ValueError(f"The run has no checkpoint in {checkpoints}: train it at least until its first checkpoint.")
-
-
-def _check_output(folder: Path, overwrite: bool) -> None:
-    """Raises ValueError if a folder contains something that an export would not replace."""
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file: name a folder to write.")
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return
-    if not (folder / "scene.json").is_file():
-        raise ValueError(f"{folder} holds other files: name an empty folder, or one that does not exist.")
-    if not overwrite:
-        raise ValueError(f"{folder} holds an export already: name another folder, or give --overwrite.")
 
 
 Command = (

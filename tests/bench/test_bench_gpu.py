@@ -93,7 +93,8 @@ def test_a_quick_look_names_what_falls_back(monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(command, "time_training", lambda *_: TIMED)
         monkeypatch.setattr(dispatch, "expect", lambda *_, **__: None)
         monkeypatch.setattr(dispatch, "_faults", dict.fromkeys(names) | faults)
-        found = command.run_quick(tmp_path, tmp_path, 16)
+        command.Gpu(quick=True, folder=tmp_path).main()
+        found = json.loads((tmp_path / "gpu.json").read_text())
         said = capsys.readouterr().out
         assert found["well"] == (not faults) and wanted in said.splitlines()[-1]
         assert not faults or f"march: plain torch, since {reason}" in said

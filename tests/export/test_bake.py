@@ -190,14 +190,13 @@ def test_training_on_forgets_what_was_baked(trainer):
     assert model.baked(model.field) is not first
 
 
-def test_a_run_is_baked_and_read_again(trainer, tmp_path):
+def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys):
     """What seen bricks show is what all show, and the file gives the same images."""
     model = filled(trainer)
-    said = []
-    scene = bake_run(trainer.pipeline, 0.003, said.append)
+    scene = bake_run(trainer.pipeline, 0.003)
     whole = model.baked(model.field)
     kept = scene.windows[0][1]
-    assert 0 < kept.mpis.num_bricks < whole.mpis.num_bricks and "bricks" in said[0]
+    assert 0 < kept.mpis.num_bricks < whole.mpis.num_bricks and "bricks are seen" in capsys.readouterr().out
     assert len(scene.path) == 8 and sum(pose.test for pose in scene.path) == 2
     write_baked(scene, tmp_path)
     for which in (scene, read_baked(tmp_path)):
@@ -205,7 +204,7 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path):
         assert found.to_exact > 35 and abs(found.exact["psnr"] - found.baked["psnr"]) < 0.3
         assert abs(found.exact["ssim"] - found.baked["ssim"]) < 0.01 and found.baked["seconds"] > 0
         assert "dB to the exact" in str(found)
-    assert bake_run(trainer.pipeline, 0, said.append).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
+    assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
 
 
 def test_the_weights_of_an_image_are_looked_at_in_parts(trainer, monkeypatch):
@@ -240,7 +239,7 @@ def test_of_many_pixels_every_nth_row_and_column_decides_which_bricks_are_seen(t
     bricks = []
     for most in (total, total / 4):
         monkeypatch.setattr(bake_module, "MOST_LOOKED_AT", most)
-        bricks.append(bake_run(trainer.pipeline, 0.003, lambda words: None).windows[0][1].mpis.num_bricks)
+        bricks.append(bake_run(trainer.pipeline, 0.003).windows[0][1].mpis.num_bricks)
     assert looked_at == [total, total // 4]
     assert 0.8 * bricks[0] < bricks[1] <= bricks[0]
 
@@ -253,7 +252,7 @@ def test_lenses_are_undistorted_once(trainer, monkeypatch):
         lens = torch.tensor([0.05, -0.02, 0.0, 0.0, 0.003, -0.002]).repeat(len(dataset.cameras), 1)
         monkeypatch.setattr(dataset.cameras, "distortion_params", lens)
     monkeypatch.setattr(type(manager.eval_dataset.cameras), "generate_rays", None)
-    scene = bake_run(trainer.pipeline, 0.003, lambda words: None)
+    scene = bake_run(trainer.pipeline, 0.003)
     assert compare(trainer.pipeline, scene, 2).to_exact > 35
 
 

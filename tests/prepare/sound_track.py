@@ -93,7 +93,7 @@ def witness_with(poses, pixels, seen, focal=FOCAL, name="incremental"):
     pairs = Pairs(table[:, 0], table[:, 1], *table[:, 2:].T.astype(float))
     names = [f"frame_{i:03d}" for i in range(count)]
     scales = scale_changes(*observed(poses, pixels, kept, focal), count)
-    return Witness(name, names, np.arange(count), poses, pairs, focal / WIDTH, 0.4, scales)
+    return Witness(name, names, np.arange(count), poses, pairs, focal / WIDTH, scales, "", pycolmap.Reconstruction())
 
 
 def observed(poses, pixels, seen, focal=FOCAL):

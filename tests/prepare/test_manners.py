@@ -18,9 +18,8 @@ from PIL import Image
 
 from mmpi_ns.prepare import images
 from mmpi_ns.prepare.checks import Finding, by_kind
-from mmpi_ns.prepare.pipeline import WORK, prepare
+from mmpi_ns.prepare.pipeline import WORK, only_one, prepare
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import PrepareError, only_one
 from mmpi_ns.utils.errors import InputError, progress
 
 NAN = float("nan")
@@ -44,7 +43,7 @@ def frames(tmp_path):
     ],
 )  # fmt: skip
 def test_options_are_judged_before_any_work(options, words, frames, tmp_path):
-    with pytest.raises(PrepareError, match=words):
+    with pytest.raises(InputError, match=words):
         prepare(Settings(frames, tmp_path / "scene", **options))
     assert not (tmp_path / "scene").exists()
 
@@ -53,14 +52,14 @@ def test_files_that_options_name_are_read_before_any_work(frames, tmp_path):
     scene, lists = tmp_path / "scene", tmp_path / "lists.json"
     for text, words in (("{", "cannot be read"), ('{"train_filenames": []}', "test_filenames")):
         lists.write_text(text)
-        with pytest.raises(PrepareError, match=words):
+        with pytest.raises(InputError, match=words):
             prepare(Settings(frames, scene, split_from=lists))
     for options in ({"poses": tmp_path / "none.txt"}, {"masks": tmp_path / "none"}, {"split_from": tmp_path / "no"}):
-        with pytest.raises(PrepareError, match=r"none|no"):
+        with pytest.raises(InputError, match=r"none|no"):
             prepare(Settings(frames, scene, **options))
     assert not scene.exists()
     lists.write_text('{"train_filenames": ["frame_001.png"], "test_filenames": ["frame_999.png"]}')
-    with pytest.raises(PrepareError, match="None of the 1 test_filenames"):
+    with pytest.raises(InputError, match="None of the 1 test_filenames"):
         prepare(Settings(frames, scene, split_from=lists))
     assert not (scene / WORK / "features").exists()
 
@@ -73,7 +72,7 @@ def test_an_old_pycolmap_is_named_with_the_remedy(frames, tmp_path, monkeypatch)
 
 
 def test_a_second_run_into_a_scene_says_so_and_ends(frames, tmp_path):
-    with only_one(tmp_path / "scene" / WORK), pytest.raises(PrepareError, match=r"Another mmpi-prepare is making"):
+    with only_one(tmp_path / "scene" / WORK), pytest.raises(InputError, match=r"Another mmpi-prepare is making"):
         prepare(Settings(frames, tmp_path / "scene"))
     with only_one(tmp_path / "scene" / WORK):
         pass  # free again
@@ -84,7 +83,7 @@ def test_a_full_disk_is_called_a_full_disk(frames, tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(images.shutil, "copyfile", full)
-    with pytest.raises(PrepareError, match=r"disk of .*scene is full"):
+    with pytest.raises(InputError, match=r"disk of .*scene is full"):
         prepare(Settings(frames, tmp_path / "scene"))
 
 

@@ -12,15 +12,15 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.prepare import adjustment, features, mappers, mapping
+from mmpi_ns.capture.matching import count_features
+from mmpi_ns.prepare import adjustment, features, mapping
 from mmpi_ns.prepare.adjustment import Free, with_all_points, with_fewer_points
 from mmpi_ns.prepare.alignment import camera_poses, similarity_between
-from mmpi_ns.prepare.images import Photo, read_photos
-from mmpi_ns.prepare.mappers import map_and_judge
-from mmpi_ns.prepare.mapping import Task
+from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import InputError
 
 COUNT = 12
 
@@ -36,7 +36,7 @@ def matched(tmp_path_factory):
 
 @pytest.fixture
 def task(matched, tmp_path):
-    names = [p.name for p in read_photos(matched / "input")]
+    names = sorted(p.name for p in (matched / "input/images").iterdir())
     free = Free(lens=True, full_lens=False, principal_point=False)
     return Task(matched / "matches/database.db", matched / "input/images", tmp_path, names, free, 1, True, True)
 
@@ -59,29 +59,29 @@ def test_of_a_long_sequence_a_hundred_images_are_placed_first(task, count, step)
 
 def test_a_long_sequence_is_confirmed_by_a_part_of_it(task, monkeypatch):
     monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
-    believed = map_and_judge(task)
-    assert believed.verdict.grade == "right" and believed.model.num_reg_images() == COUNT
-    assert f"{COUNT // 2} of {COUNT // 2} images" in believed.says and "global-all" not in believed.says
-    assert error_of(believed.model) < 0.01
+    model, says, verdict = map_and_judge(task)
+    assert verdict.grade == "right" and model.num_reg_images() == COUNT
+    assert f"{COUNT // 2} of {COUNT // 2} images" in says and "global-all" not in says
+    assert error_of(model) < 0.01
 
 
 def test_all_images_are_placed_at_once_where_the_incremental_mapper_fails(task, monkeypatch):
     def fail(*args):
-        raise PrepareError("no pair can start")
+        raise InputError("no pair can start")
 
     monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
-    monkeypatch.setattr(mappers, "reconstruct", fail)
-    believed = map_and_judge(task)
-    assert believed.model.num_reg_images() == COUNT and believed.says.startswith("global-all")
-    assert error_of(believed.model) < 0.01
-    monkeypatch.setattr(mappers, "map_globally", lambda *args: None)
+    monkeypatch.setattr(mapping, "reconstruct", fail)
+    model, says, _ = map_and_judge(task)
+    assert model.num_reg_images() == COUNT and says.startswith("global-all")
+    assert error_of(model) < 0.01
+    monkeypatch.setattr(mapping, "map_globally", lambda *args: None)
     (task.work / "none").mkdir()
-    with pytest.raises(PrepareError, match="no pair can start"):
+    with pytest.raises(InputError, match="no pair can start"):
         map_and_judge(replace(task, work=task.work / "none"))
 
 
 def test_a_global_model_without_points_neither_counts_nor_gives_its_focal_length(task, monkeypatch):
-    place, build, starts = mappers.map_globally, mappers.reconstruct, []
+    place, build, starts = mapping.map_globally, mapping.reconstruct, []
 
     def without_points(*args):
         model = place(*args)
@@ -93,11 +93,11 @@ def test_a_global_model_without_points_neither_counts_nor_gives_its_focal_length
         starts.append(start)
         return build(task, start, attempts)
 
-    monkeypatch.setattr(mappers, "map_globally", without_points)
-    monkeypatch.setattr(mappers, "reconstruct", watch)
-    believed = map_and_judge(task)
-    assert believed.says.startswith("incremental") and "global" not in believed.says
-    assert starts == [task.database] and error_of(believed.model) < 0.01
+    monkeypatch.setattr(mapping, "map_globally", without_points)
+    monkeypatch.setattr(mapping, "reconstruct", watch)
+    model, says, _ = map_and_judge(task)
+    assert says.startswith("incremental") and "global" not in says
+    assert starts == [task.database] and error_of(model) < 0.01
 
 
 def test_a_placed_model_is_given_the_points_of_all_matches_and_adjusted(task):
@@ -152,10 +152,10 @@ def test_weak_features_count_where_images_have_few(tmp_path, monkeypatch, is_poo
     photos = [Photo(f"{i}.png", 640, 480) for i in range(3)]
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[600, 320, 240, 0], camera_id=1)
     features.create_database(tmp_path / "database.db", photos, [1] * 3, [camera])
-    found = features.extract(tmp_path / "database.db", tmp_path / "images", photos, None, 8192, 1)
+    features.extract(tmp_path / "database.db", tmp_path / "images", photos, None, 8192, 1)
     usual = pycolmap.FeatureExtractionOptions().sift.peak_threshold
     assert asked[-1] == (3, pytest.approx(features.FAINT if is_poor else usual))
-    assert min(found) > 50 and not (tmp_path / "sample.db").exists()
+    assert min(count_features(tmp_path / "database.db")) > 50 and not (tmp_path / "sample.db").exists()
 
 
 def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task, monkeypatch):
@@ -165,8 +165,8 @@ def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task
         made.append(adjustment.polish(*args))
         return made[-1]
 
-    monkeypatch.setattr(mappers, "polish", watch)
-    assert map_and_judge(task).model is made[-1]
+    monkeypatch.setattr(mapping, "polish", watch)
+    assert map_and_judge(task)[0] is made[-1]
 
     def spoil(model, *rest):
         spoilt = watch(model, *rest)
@@ -174,6 +174,6 @@ def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task
             spoilt.delete_point3D(number)
         return spoilt
 
-    monkeypatch.setattr(mappers, "polish", spoil)
-    believed = map_and_judge(task)
-    assert believed.model is not made[-1] and believed.verdict.grade == "right"
+    monkeypatch.setattr(mapping, "polish", spoil)
+    model, _, verdict = map_and_judge(task)
+    assert model is not made[-1] and verdict.grade == "right"

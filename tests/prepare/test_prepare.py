@@ -15,7 +15,7 @@ from reprojection import median_reprojection_error
 
 from mmpi_ns.capture.observe import read_observations
 from mmpi_ns.capture.sfm import find_sfm_model
-from mmpi_ns.prepare import features, mappers, mapping
+from mmpi_ns.prepare import features, mapping
 from mmpi_ns.prepare.alignment import camera_poses, similarity_between
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
@@ -126,10 +126,10 @@ def test_report_states_the_figures(scene):
 
 
 def test_existing_scene_is_refused_and_left_alone(scene, capture):
-    from mmpi_ns.prepare.stages import PrepareError
+    from mmpi_ns.utils.errors import InputError
 
     before = (scene / "transforms.json").read_bytes()
-    with pytest.raises(PrepareError, match="already holds"):
+    with pytest.raises(InputError, match="already holds"):
         prepare(Settings(capture / "frames", scene, threads=1))
     assert (scene / "transforms.json").read_bytes() == before
 
@@ -141,7 +141,7 @@ def test_interrupted_run_goes_on_without_redoing_what_was_done(capture, tmp_path
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(mappers, "reconstruct", interrupt)
+        patched.setattr(mapping, "reconstruct", interrupt)
         with pytest.raises(KeyboardInterrupt):
             prepare(settings)
     assert not (tmp_path / "scene/transforms.json").exists()

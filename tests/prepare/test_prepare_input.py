@@ -12,7 +12,6 @@ from PIL.TiffImagePlugin import IFDRational
 
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.prepare import checks, export, features
-from mmpi_ns.prepare.alignment import up_from_cameras
 from mmpi_ns.prepare.checks import exposure_in_words
 from mmpi_ns.prepare.images import (
     Photo,
@@ -24,12 +23,11 @@ from mmpi_ns.prepare.images import (
     read_intrinsics,
     reads_heif,
     scene_names,
-    share,
 )
 from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.video import choose_frames, measure, select_frames
+from mmpi_ns.utils.errors import InputError
 
 
 def save(path, size=(40, 30), value=100, **more):
@@ -167,7 +165,7 @@ def test_masks_of_two_folders_go_to_the_images_of_theirs(tmp_path):
 
 def test_mask_of_another_size_is_refused(tmp_path):
     save(tmp_path / "masks/a.png", (5, 3), 0)
-    with pytest.raises(PrepareError, match="5x3"):
+    with pytest.raises(InputError, match="5x3"):
         gather_masks(tmp_path / "masks", [Photo("a.jpg", 4, 3, source="a.jpg")], tmp_path / "out")
 
 
@@ -181,24 +179,25 @@ def test_masked_pixels_stay_masked_when_downscaled(tmp_path):
 
 def test_images_of_one_lens_share_a_camera():
     photos = [Photo("a", 4, 3, "x"), Photo("b", 4, 3, "x"), Photo("c", 4, 3, "y"), Photo("d", 8, 6, "x")]
-    assert share(photos, "auto", {}) == [1, 1, 2, 3]
-    assert share(photos, "per-image", {}) == [1, 2, 3, 4]
-    with pytest.raises(PrepareError, match="different sizes"):
-        share(photos, "shared", {})
+    for sharing, numbers in (("auto", [1, 1, 2, 3]), ("per-image", [1, 2, 3, 4])):
+        assert make_cameras(photos, sharing, {}, None, "auto")[0] == numbers
+    with pytest.raises(InputError, match="different sizes"):
+        make_cameras(photos, "shared", {}, None, "auto")
 
 
 def test_focal_length_comes_from_the_option_then_exif_then_a_guess():
     photos = [Photo("a", 100, 50, exif_focal=77.0)]
-    assert make_cameras(photos, [1], {}, 60.0, "auto")[0].mean_focal_length() == 60
-    assert make_cameras(photos, [1], {}, None, "auto")[0].mean_focal_length() == 77
-    assert make_cameras([Photo("a", 100, 50)], [1], {}, None, "auto")[0].mean_focal_length() == 120
+    bare = [Photo("a", 100, 50)]
+    for images, focal, expected in ((photos, 60.0, 60), (photos, None, 77), (bare, None, 120)):
+        (camera,) = make_cameras(images, "auto", {}, focal, "auto")[1]
+        assert camera.mean_focal_length() == expected
 
 
 def test_given_camera_comes_back_from_colmaps():
     given = parse_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
-    camera = make_cameras([Photo("a", 100, 50)], [1], {"a": given}, None, "auto")[0]
+    (camera,) = make_cameras([Photo("a", 100, 50)], "auto", {"a": given}, None, "auto")[1]
     assert read_intrinsics(camera) == given
-    with pytest.raises(PrepareError, match="--camera takes"):
+    with pytest.raises(InputError, match="--camera takes"):
         parse_camera((1.0, 2.0), fisheye=False)
 
 
@@ -216,17 +215,23 @@ def test_matching_is_chosen_by_count_and_order():
     numbered = [f"f{i:03d}.jpg" for i in range(200)]
     shuffled = np.random.default_rng(0).permutation(200)
     mixed = chain(200)[np.ix_(shuffled, shuffled)]
-    assert features.choose("auto", numbered[:20], chain(20), False)[0] == "exhaustive"
-    assert features.choose("auto", numbered, chain(200), False)[0] == "sequential"
-    assert features.choose("auto", numbered, mixed, False)[0] == "retrieval"
-    assert features.choose("auto", numbered[:100], mixed[:100, :100], False)[0] == "exhaustive"
-    assert features.choose("auto", numbered, mixed, True)[0] == "sequential"
+    for names, alike, from_video, way in (
+        (numbered[:20], chain(20), False, "exhaustive (20 images are few)"),
+        (numbered, chain(200), False, "sequential (numbered frames that look like their neighbours), 0 pairs"),
+        (numbered, mixed, False, "retrieval (200 images in no order are too many to match all)"),
+        (numbered[:100], mixed[:100, :100], False, "exhaustive (100 images in no order)"),
+        (numbered, mixed, True, "sequential (frames of a video), "),
+    ):
+        assert features.choose_pairs("auto", names, alike, 10, from_video)[1].startswith(way)
 
 
 def test_revisits_close_the_loop_and_a_straight_drive_has_none():
-    found = features.revisits(chain(150, loop=10), 10)
-    assert (0, 140) in found and all(i < 20 and j >= 130 for i, j in found)
-    assert features.revisits(chain(150), 10) == []
+    names = [str(i) for i in range(150)]
+    found, _ = features.choose_pairs("sequential", names, chain(150, loop=10), 10, False)
+    again = [(i, j) for i, j in found if j - i > 45]
+    assert (0, 140) in again and all(i < 20 and j >= 130 for i, j in again)
+    straight, says = features.choose_pairs("sequential", names, chain(150), 10, False)
+    assert says.endswith(" 0 pairs that may be revisits") and max(j - i for i, j in straight) == 45
 
 
 def test_look_alikes_are_found_by_their_features(tmp_path):
@@ -234,21 +239,10 @@ def test_look_alikes_are_found_by_their_features(tmp_path):
         corridor.write_images(tmp_path / "in" / str(seed), 2, seed=seed)
     photos = gather(tmp_path / "in", find_images(tmp_path / "in"), tmp_path)
     database = tmp_path / "database.db"
-    features.create_database(database, photos, [1] * 4, make_cameras(photos, [1] * 4, {}, None, "auto"))
+    features.create_database(database, photos, *make_cameras(photos, "shared", {}, None, "auto"))
     features.extract(database, tmp_path / "images", photos, None, 1000, 1)
     alike = features.image_similarity(database, 4)
     assert alike.argmax(-1).tolist() == [1, 0, 3, 2]
-
-
-def test_up_is_found_by_cameras_that_look_down_on_a_turn():
-    poses = np.tile(np.eye(4), (9, 1, 1))
-    for pose, angle in zip(poses, np.linspace(0, 2, 9), strict=True):
-        right = np.array([np.cos(angle), -np.sin(angle), 0])
-        forward = np.array([np.sin(angle), np.cos(angle), -0.6]) / np.sqrt(1.36)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
-    assert up_from_cameras(poses) == pytest.approx([0, 0, 1], abs=1e-9)
-    straight = corridor.poses(5, bend=0.0)
-    assert up_from_cameras(straight) == pytest.approx([0, 0, 1], abs=1e-9)
 
 
 def test_split_by_count_and_by_list():
@@ -257,7 +251,7 @@ def test_split_by_count_and_by_list():
     assert split.train == ("1.jpg", "4.jpg", "7.jpg") and len(split.test) == 6
     lists = {"train_filenames": ["x/2.jpg"], "test_filenames": ["x/3.jpg", "x/99.jpg"]}
     assert export.split_from(lists, names, "s").test == ("3.jpg",)
-    with pytest.raises(PrepareError, match="among the registered"):
+    with pytest.raises(InputError, match="among the registered"):
         export.split_from({"train_filenames": ["2.jpg"], "test_filenames": ["77.jpg"]}, names, "s")
 
 
@@ -296,10 +290,10 @@ def test_no_more_frames_than_asked():
 
 def test_broken_video_is_named(tmp_path, drive):
     (tmp_path / "no.mp4").write_bytes(b"not a video at all" * 100)
-    with pytest.raises(PrepareError, match=r"no\.mp4"):
+    with pytest.raises(InputError, match=r"no\.mp4"):
         measure(tmp_path / "no.mp4")
     still = write_video(tmp_path / "still.avi", [drive[0]] * 5)
-    with pytest.raises(PrepareError, match="no motion"):
+    with pytest.raises(InputError, match="no motion"):
         select_frames(still, tmp_path / "out2", 300, 0.02)
 
 
@@ -308,13 +302,13 @@ def test_too_few_images_are_refused(count, words, tmp_path):
     (tmp_path / "in").mkdir()
     for n in range(count):
         save(tmp_path / "in" / f"{n}.png")
-    with pytest.raises(PrepareError, match=words):
+    with pytest.raises(InputError, match=words):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
 
 
 def test_two_images_without_poses_are_refused_before_any_work(tmp_path):
     corridor.write_images(tmp_path / "in", 2)
-    with pytest.raises(PrepareError, match="for 2 images alone, as no third confirms them"):
+    with pytest.raises(InputError, match="for 2 images alone, as no third confirms them"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
     assert not (tmp_path / "scene/.prepare/features").exists()
 
@@ -322,14 +316,14 @@ def test_two_images_without_poses_are_refused_before_any_work(tmp_path):
 def test_truncated_image_is_named(tmp_path):
     save(tmp_path / "in/a.png")
     (tmp_path / "in/b.jpg").write_bytes(save(tmp_path / "whole.jpg", (90, 90)).read_bytes()[:300])
-    with pytest.raises(PrepareError, match=r"b\.jpg cannot be read"):
+    with pytest.raises(InputError, match=r"b\.jpg cannot be read"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
 
 
 def test_blank_images_are_refused(tmp_path):
     for n in range(3):
         save(tmp_path / "in" / f"{n}.png")
-    with pytest.raises(PrepareError, match="Hardly any features"):
+    with pytest.raises(InputError, match="Hardly any features"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
 
 
@@ -337,7 +331,7 @@ def test_images_without_overlap_are_refused(tmp_path):
     (tmp_path / "in").mkdir()
     for n in range(3):
         Image.fromarray(corridor.picture(corridor.poses(1)[0], seed=n)).save(tmp_path / "in" / f"{n}.png")
-    with pytest.raises(PrepareError, match="overlap"):
+    with pytest.raises(InputError, match="overlap"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
 
 
@@ -353,7 +347,7 @@ def test_two_disconnected_groups_are_named_and_the_larger_can_be_had(tmp_path):
 def test_scene_and_input_are_kept_apart(tmp_path):
     corridor.write_images(tmp_path / "scene/images", 2)
     for scene in (tmp_path / "scene", tmp_path / "scene/images", tmp_path / "scene/images/out"):
-        with pytest.raises(PrepareError, match="mixed with its input"):
+        with pytest.raises(InputError, match="mixed with its input"):
             prepare(Settings(tmp_path / "scene/images", scene, overwrite=True))
     assert len(list((tmp_path / "scene/images").iterdir())) == 2
 

@@ -14,11 +14,11 @@ from PIL import Image
 
 from mmpi_ns.capture.matching import rigid3d
 from mmpi_ns.prepare import export, features, mapping
-from mmpi_ns.prepare.adjustment import Free, adjust, polish
+from mmpi_ns.prepare.adjustment import Free, adjust, is_bent, polish, quality
 from mmpi_ns.prepare.alignment import choose_frame, similarity_between
-from mmpi_ns.prepare.images import Intrinsics, Photo, make_cameras, read_intrinsics, share
-from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.prepare.images import Intrinsics, Photo, make_cameras, read_intrinsics
 from mmpi_ns.prepare.video import choose_frames, median_motion
+from mmpi_ns.utils.errors import InputError
 
 
 def model_of(poses, *cameras):
@@ -42,12 +42,15 @@ def test_a_sequence_is_matched_with_near_and_far_frames_and_where_it_comes_back(
     place[115:] = place[:5]  # comes back to its start
     alike = np.exp(-((place[:, None] - place) ** 2) / 50).astype(np.float32)
     np.fill_diagonal(alike, -1)
-    found = features.list_pairs("sequential", alike, 4)
+    names = [str(i) for i in range(120)]
+    found, says = features.choose_pairs("sequential", names, alike, 4, False)
     steps = {j - i for i, j in found if j < 115}
     assert steps == {1, 2, 3, 4, 15, 20, 30, 45}
     assert sum(j - i == 45 for i, j in found) == 120 - 45
     assert {(i, 115 + i) for i in range(5)} <= set(found)
-    assert len(features.list_pairs("exhaustive", alike[:7, :7], 4)) == 21
+    again = sum(j - i > 45 for i, j in found)
+    assert says == f"sequential (as asked), {again} pairs that may be revisits"
+    assert len(features.choose_pairs("exhaustive", names[:7], alike[:7, :7], 4, False)[0]) == 21
 
 
 # The scene's frame ---------------------------------------------------------------------------------------------------
@@ -58,15 +61,26 @@ def test_without_metres_the_track_is_one_unit_long_about_the_origin_and_heads_al
     poses = corridor.poses(9, bend=0.02)
     moved = np.tile(np.eye(4), (9, 1, 1))
     moved[:, :3, :3], moved[:, :3, 3] = turn @ poses[:, :3, :3], 7 * poses[:, :3, 3] @ turn.T + [3, -2, 5]
-    frame = choose_frame(model_of(moved), None)
-    centers = np.array([frame.similarity * c for c in moved[:, :3, 3]])
-    rotations = frame.similarity.rotation.matrix() @ moved[:, :3, :3]
+    similarity, _, unit = choose_frame(model_of(moved), None)
+    centers = np.array([similarity * c for c in moved[:, :3, 3]])
+    rotations = similarity.rotation.matrix() @ moved[:, :3, :3]
     assert centers.mean(0) == pytest.approx([0, 0, 0], abs=1e-9)
     along = np.linalg.svd(centers)[2][0]
     assert np.ptp(centers @ along) == pytest.approx(1)
     assert rotations[:, 2, 1] == pytest.approx(np.full(9, -1.0))  # down in the image is down
     assert rotations[0, :, 2] == pytest.approx([0, 1, 0], abs=1e-9)
-    assert centers[-1, 1] > centers[0, 1] + 0.9 and "extent" in frame.unit
+    assert centers[-1, 1] > centers[0, 1] + 0.9 and "extent" in unit
+
+
+def test_up_is_found_by_cameras_that_look_down_on_a_turn():
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    for pose, angle in zip(poses, np.linspace(0, 2, 9), strict=True):
+        right = np.array([np.cos(angle), -np.sin(angle), 0])
+        forward = np.array([np.sin(angle), np.cos(angle), -0.6]) / np.sqrt(1.36)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
+    assert choose_frame(model_of(poses), None)[0].rotation.matrix()[2] == pytest.approx([0, 0, 1], abs=1e-9)
+    straight = corridor.poses(5, bend=0.0)
+    assert choose_frame(model_of(straight), None)[0].rotation.matrix()[2] == pytest.approx([0, 0, 1], abs=1e-9)
 
 
 def test_a_straight_track_is_fitted_without_a_turn_about_itself():
@@ -127,7 +141,7 @@ def test_a_lens_of_colmap_projects_as_opencv_says(model, params):
 
 
 def test_a_lens_without_a_place_in_transforms_is_named():
-    with pytest.raises(PrepareError, match="FULL_OPENCV"):
+    with pytest.raises(InputError, match="FULL_OPENCV"):
         read_intrinsics(pycolmap.Camera(model="FULL_OPENCV", params=[150, 140, 98, 83, *[0.0] * 8], **SIZE))
 
 
@@ -135,9 +149,8 @@ def test_given_lenses_are_kept_apart_and_come_back_from_colmaps():
     photos = [Photo(name, 200, 160, source=name) for name in "abcd"]
     first = Intrinsics(150.0, 140.0, 98.0, 83.0, (0.1, -0.05, 0.02, -0.01), fisheye=True)
     given = {"a": first, "b": Intrinsics(150.0, 140.0, 98.0, 83.0), "c": first}
-    numbers = share(photos, "auto", given)
-    assert numbers == [1, 2, 1, 3]
-    cameras = make_cameras(photos, numbers, given, 120.0, "auto")
+    numbers, cameras = make_cameras(photos, "auto", given, 120.0, "auto")
+    assert numbers == [1, 2, 1, 3] and [c.camera_id for c in cameras] == [1, 2, 3]
     assert [c.model.name for c in cameras[:2]] == ["OPENCV_FISHEYE", "PINHOLE"]
     assert [read_intrinsics(c) for c in cameras[:2]] == [given["a"], given["b"]]
 
@@ -164,7 +177,7 @@ def test_images_of_several_cameras_state_their_own_intrinsics():
         content["fl_x"] == 151 and content["k4"] == 1 and set(content["frames"][0]) == {"file_path", "transform_matrix"}
     )
     mixed = [shared, pycolmap.Camera(model="PINHOLE", params=[9, 9, 4, 3], width=8, height=6, camera_id=3)]
-    with pytest.raises(PrepareError, match="Fisheye and perspective"):
+    with pytest.raises(InputError, match="Fisheye and perspective"):
         export.transforms(model_of(corridor.poses(2), *mixed), split, False, {})
 
 
@@ -212,10 +225,10 @@ def found_model(images, error, width=1000):
 
 
 def test_a_sound_model_beats_a_bent_one_with_more_images_and_errors_are_judged_by_image_size():
-    assert mapping.is_bent(found_model(9, 0.9)) and not mapping.is_bent(found_model(9, 0.7))
-    assert not mapping.is_bent(found_model(9, 1.5, width=2000)) and mapping.is_bent(found_model(9, 0.9, width=300))
+    assert is_bent(found_model(9, 0.9)) and not is_bent(found_model(9, 0.7))
+    assert not is_bent(found_model(9, 1.5, width=2000)) and is_bent(found_model(9, 0.9, width=300))
     models = [found_model(50, 0.9), found_model(30, 0.7), found_model(31, 0.7), found_model(31, 0.6)]
-    ranked = sorted(range(4), key=lambda i: mapping._quality(models[i]))
+    ranked = sorted(range(4), key=lambda i: quality(models[i]))
     assert ranked == [0, 1, 2, 3]
 
 

@@ -13,7 +13,7 @@ from mmpi_ns.prepare.images import Intrinsics, Photo
 from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.poses import read_poses
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import InputError
 
 COUNT = 8
 GIVEN = corridor.poses(COUNT)
@@ -96,7 +96,7 @@ def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_pa
     known, _ = read(write_transforms(path, GIVEN, **lens, k4=0.6, camera_model="OPENCV_FISHEYE"))
     assert known.intrinsics["frame_008.png"] == Intrinsics(170.0, 175.0, 118.0, 81.0, (0.1, 0.2, 0.5, 0.6), True)
     assert known.split is None
-    with pytest.raises(PrepareError, match="says otherwise"):
+    with pytest.raises(InputError, match="says otherwise"):
         read(write_transforms(path, GIVEN, w=400))
 
 
@@ -111,13 +111,13 @@ def test_images_of_one_name_in_two_folders_get_the_poses_of_their_folders_or_non
     path.write_text(json.dumps({"frames": frames[::-1]}))
     assert read(path, photos=photos)[1] == pytest.approx(GIVEN[:4], abs=1e-9)
     path.write_text(json.dumps({"frames": frames[:2]}))
-    with pytest.raises(PrepareError, match=r"one pose for left-000\.png and right-000\.png"):
+    with pytest.raises(InputError, match=r"one pose for left-000\.png and right-000\.png"):
         read(path, photos=photos)
     folder = tmp_path / "poses"
     folder.mkdir()
     for n in range(2):
         np.savetxt(folder / f"{n:03d}.txt", GIVEN[n])
-    with pytest.raises(PrepareError, match="one pose for"):
+    with pytest.raises(InputError, match="one pose for"):
         read(folder, photos=photos)
 
 
@@ -125,7 +125,7 @@ def test_lines_that_no_number_of_an_image_can_name_are_refused(tmp_path):
     path = write_kitti(tmp_path / "poses.txt", corridor.poses(30))
     for last in ("30", "three"):
         photos = [Photo(f"{n}.png", 9, 9, source=f"{n}.png") for n in ("3", "10", last)]
-        with pytest.raises(PrepareError, match="30 poses for 3 images: they cannot be matched"):
+        with pytest.raises(InputError, match="30 poses for 3 images: they cannot be matched"):
             read(path, photos=photos)
 
 
@@ -141,7 +141,7 @@ def test_lines_that_no_number_of_an_image_can_name_are_refused(tmp_path):
 )
 def test_poses_that_make_no_sense_are_named(text, words, tmp_path):
     (tmp_path / "poses.txt").write_text(text)
-    with pytest.raises(PrepareError, match=words):
+    with pytest.raises(InputError, match=words):
         read(tmp_path / "poses.txt")
 
 
@@ -193,11 +193,11 @@ def test_refining_brings_disturbed_poses_back(frames, tmp_path):
 
 def test_poses_with_other_axes_are_refused(frames, tmp_path):
     poses = write_kitti(tmp_path / "poses.txt", GIVEN @ FLIP)
-    with pytest.raises(PrepareError, match="--poses-axes"):
+    with pytest.raises(InputError, match="--poses-axes"):
         prepare(Settings(frames, tmp_path / "scene", poses=poses, focal=corridor.FOCAL, threads=1))
 
 
 def test_known_poses_want_intrinsics(frames, tmp_path):
     poses = write_kitti(tmp_path / "poses.txt", GIVEN)
-    with pytest.raises(PrepareError, match="--focal or --camera"):
+    with pytest.raises(InputError, match="--focal or --camera"):
         prepare(Settings(frames, tmp_path / "scene", poses=poses, threads=1))

@@ -19,8 +19,10 @@ def template(node):
     return None
 
 
-def parsed():
-    return [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "mmpi_ns").rglob("*.py")]
+def parsed(but=""):
+    """The modules of the package, but for those of one folder."""
+    paths = [path for path in (ROOT / "mmpi_ns").rglob("*.py") if path.parent.name != but]
+    return [ast.parse(path.read_text(encoding="utf-8")) for path in paths]
 
 
 def raised(trees):
@@ -50,8 +52,9 @@ def test_every_sentence_of_the_table_is_in_the_code():
 
 
 def test_every_error_of_the_code_is_in_the_table():
+    """But those of mmpi-prepare, which ends with them before anything is made (docs/prepare.md)."""
     told = {sentence for sentence, _ in rows()}
-    missing = sorted(text for text in raised(parsed()) if text not in told and text.strip("{}: "))
+    missing = sorted(text for text in raised(parsed("prepare")) if text not in told and text.strip("{}: "))
     assert not missing, "\n".join(missing)
 
 

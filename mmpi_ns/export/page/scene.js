@@ -3,7 +3,7 @@
 
 class Refusal extends Error {} // an error whose message is a sentence for the reader
 
-const CHUNK = 8, WORD_WIDTH = 2048;
+const WORD_WIDTH = 2048;
 
 // An array of a window, from bytes that begin at `from` in its file.
 async function unpack(bytes, spec, from = 0) {
