@@ -20,9 +20,9 @@ from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, ground_of
 from mmpi_ns.capture.moving_objects import followed, grown, unexplained, without_holes
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View, camera_matrix
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset
-from mmpi_ns.synthetic.movers import MOVER, with_movers
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset
+from mmpi_scene.movers import MOVER, with_movers
 
 SIZE = (60, 80)
 PINHOLE = np.array([70.0, 70.0, 40.0, 30.0])

@@ -20,7 +20,8 @@ def template(node):
 
 
 def parsed():
-    return [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "mmpi_ns").rglob("*.py")]
+    folders = (ROOT / "mmpi_ns", ROOT / "mmpi_scene")
+    return [ast.parse(path.read_text(encoding="utf-8")) for folder in folders for path in folder.rglob("*.py")]
 
 
 def raised(trees):
