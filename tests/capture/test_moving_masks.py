@@ -13,7 +13,7 @@ import pytest
 from training_runs import datamanager
 
 from mmpi_ns.capture import moving
-from mmpi_ns.capture.dense import Depth, Parallax
+from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.capture.moving import find_moving, in_image
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, ground_of, nearest_known, splat
@@ -76,15 +76,18 @@ def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed
     """One row: swept, followed, a seed, each with a static pixel and one that is not."""
     swept, followed_pixels, seed, static = (np.zeros((1, 6), bool) for _ in range(4))
     swept[0, :2] = followed_pixels[0, 2:4] = seed[0, 4:] = static[0, ::2] = True
+    monkeypatch.setattr(moving.Neighbour, "of", lambda *_: None)
     sweeps = moving.Sweep(swept, swept)
     for name, value in (
-        ("at_exposure_of", None), ("sweep", sweeps), ("evidence", None), ("is_static", static), ("seeds", seed),
+        ("gain_of", None), ("sweep", sweeps), ("evidence", None), ("is_static", static), ("seeds", seed),
         ("followed", followed_pixels),
     ):  # fmt: skip
         monkeypatch.setattr(moving, name, lambda *_, value=value: value)
     monkeypatch.setattr(moving, "grown", lambda shot, shown, core: core)
     masks = [np.ones((1, 6), bool)] * 3
-    core, _ = moving._moves([None] * 3, [1, 2], 0, masks, None)  # type: ignore[list-item]
+    nothing = Depth(*np.zeros((2, 1, 6), np.float32))
+    shot = Shot(View(np.zeros((1, 6), np.uint8), np.ones(4), np.eye(4)[:3], static), np.zeros((1, 6, 3)), nothing, None)
+    core, _ = moving._moves([shot] * 3, [1, 2], 0, masks, None)
     assert core[0].tolist() == [False, True, False, True, True, True]
 
 
@@ -154,7 +157,7 @@ def textured(seed, shape=SIZE, grain=1.5):
 
 
 def neighbours(shot, *others):
-    return [Neighbour(other, other.color, Parallax.between(shot.view, other.view)) for other in others]
+    return [Neighbour.of(shot, other) for other in others]
 
 
 def test_a_wall_is_explained_by_its_depth_and_another_picture_is_not():
