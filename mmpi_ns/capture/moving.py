@@ -201,6 +201,7 @@ def _moves(
     if len(others) >= 2:
         core |= seeds(shot, others, shown, first.levels)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        flow.setVariationalRefinementIterations(0)
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow) & ~static

@@ -176,9 +176,9 @@ class Warp:
     @staticmethod
     def between(view: View, other: View) -> Warp:
         parallax, middle = Parallax.between(view, other), np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-        x, y = pixel_grid(view.gray.shape)
-        linear, shifts = (middle @ parallax.linear).astype(np.float32), middle @ parallax.b
-        return Warp([a[0] * x + a[1] * y + a[2] for a in linear], shifts.tolist())
+        y, x = (np.arange(n) + 0.5 for n in view.gray.shape)
+        far = [np.add.outer(a[1] * y + a[2], a[0] * x, dtype=np.float32) for a in middle @ parallax.linear]
+        return Warp(far, (middle @ parallax.b).tolist())
 
     def at(self, pixels: tuple[NDArray[np.intp], ...], times: int) -> Warp:
         """Of some pixels, in so many equal rows."""

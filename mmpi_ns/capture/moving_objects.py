@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
+from mmpi_ns.capture.dense import correlation, mean_and_contrast
 from mmpi_ns.capture.moving_evidence import (
     ALL,
     SOLID,
@@ -20,6 +20,7 @@ from mmpi_ns.capture.moving_evidence import (
     Mask,
     Neighbour,
     Shot,
+    Warp,
     all_where,
     most_of_channels,
     two_least,
@@ -195,8 +196,9 @@ def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> M
     Both look the same way first: optical flow finds what is near the same pixel, and turning the head shifts all.
     """
     gray = shot.view.gray
-    x, y, _ = Parallax.between(shot.view, other.view).pixels(np.zeros(gray.shape, np.float32))
-    turned, moves = look_up(other.view.gray, x, y), look_up(mask.astype(np.uint8), x, y, nearest=True)
+    x, y, ahead = Warp.between(shot.view, other.view).places(np.zeros(gray.shape, np.float32))
+    moves = cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST) * (ahead > 0)
+    turned = np.asarray(cv2.remap(other.view.gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     there = np.asarray(flow.calc(gray, turned, None))  # type: ignore[call-overload]
     back = np.asarray(flow.calc(turned, gray, None))  # type: ignore[call-overload]
     x, y = pixel_grid(gray.shape)
