@@ -45,8 +45,8 @@ AFTER = 2
 """Nearest neighbours from which objects are followed."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
-SECONDS = 0.7
-"""Processor seconds for an image, for the forecast (docs/results/moving.md)."""
+SECONDS = 0.4
+"""Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is."""
 VERSION = 8

@@ -201,7 +201,7 @@ def least_levels(shot, others, row, column, steps):
 
 
 def test_levels_are_those_of_every_depth_or_fewer_than_a_seed_needs():
-    others = [a_shot(0.1 * k, textured(k + 5), 0.5) for k in (-2, -1, 1)]
+    others = [a_shot(0.5 * k, textured(k + 5), 0.5) for k in (-2, -1, 1)]
     shot = a_shot(0.0, textured(1), 0.5)
     candidates = np.zeros(SIZE, bool)
     candidates[5::11, ::9] = True
