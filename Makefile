@@ -83,4 +83,4 @@ results: venv ## Make the tables of docs/results that take minutes again, and sa
 
 clean: ## Remove build products and caches (not .venv)
 	rm -rf build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
-	find mmpi_ns benchmarks examples tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find mmpi_ns mmpi_scene benchmarks examples tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.scene import render
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.scene import render
 
 Array = NDArray[np.float64]
 Known = tuple[tuple[str, ...], Array, float, Callable[[int], Path | NDArray[np.uint8]]]

@@ -20,8 +20,8 @@ from report import Bench, Report, Row, page, table
 from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.config import mmpi_small
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import ExposureName, light_of, make_exposure, tone, write_dataset
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import ExposureName, light_of, make_exposure, tone, write_dataset
 
 STREETS: tuple[ExposureName, ...] = ("none", "auto", "vignetting")
 GREYS = (0.3, 0.5, 0.7)

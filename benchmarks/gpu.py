@@ -15,8 +15,8 @@ from report import Bench, Report, Row, page, slug, table, title
 
 from mmpi_ns.bench.trainers import has_pycolmap
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset
 
 SHARES = {"checks": 0.25, "training triton": 0.25, "training torch": 0.2, "kitti": 0.3}
 """The parts in the order in which they run, and their shares of the time; what one leaves, the next ones have."""

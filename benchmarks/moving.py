@@ -20,9 +20,9 @@ from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.capture.moving import moving_masks
 from mmpi_ns.config import mmpi_small
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset
-from mmpi_ns.synthetic.movers import MOVER, with_movers
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset
+from mmpi_scene.movers import MOVER, with_movers
 
 STREETS = (*(("street", seed) for seed in range(5)), *(("walk", seed) for seed in range(3)))
 """Names and seeds of the procedural scenes with movers."""

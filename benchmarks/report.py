@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 import torch
 
 import mmpi_ns
+import mmpi_scene
 from mmpi_ns.utils.machine import commit, processor
 from mmpi_ns.utils.values import Number, check_options
 
@@ -150,8 +151,8 @@ def title(text: str) -> str:
 
 
 def fingerprint() -> str:
-    """Hash of torch's version and of the sources of the package and the benchmarks."""
-    folders = Path(mmpi_ns.__file__).resolve().parent, Path(__file__).resolve().parent
+    """Hash of torch's version and of the sources of the packages and the benchmarks."""
+    folders = [Path(module).resolve().parent for module in (mmpi_ns.__file__, mmpi_scene.__file__, __file__)]
     digest = hashlib.sha256(torch.__version__.encode())
     for path in sorted(p for folder in folders for p in folder.rglob("*") if p.suffix in (".py", ".cpp", ".h")):
         digest.update(path.read_bytes())

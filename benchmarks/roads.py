@@ -24,9 +24,9 @@ from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.windows import Window
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic import catalogue
-from mmpi_ns.synthetic.dataset import image_name, write_dataset
-from mmpi_ns.synthetic.scene import render
+from mmpi_scene import catalogue
+from mmpi_scene.dataset import image_name, write_dataset
+from mmpi_scene.scene import render
 
 BYTES_A_TEXEL = 4 * (1 + 9 + 1) + 1
 """Density, features, reliability and the mark of having been trained."""

@@ -16,10 +16,10 @@ import numpy as np
 import tyro
 
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic.cameras import Array, Cameras
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset, write_depths
-from mmpi_ns.synthetic.scene import Colors, Scene, render
+from mmpi_scene.cameras import Array, Cameras
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset, write_depths
+from mmpi_scene.scene import Colors, Scene, render
 
 Wrong = Literal["scattered", "mirror", "car"]
 """How the depths of training images are wrong."""

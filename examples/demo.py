@@ -107,8 +107,8 @@ class Demo:
         print(f"\n=== {number}/{PARTS} {what} ===", flush=True)
 
     def _make_scene(self) -> None:
-        from mmpi_ns.synthetic.catalogue import make_scene
-        from mmpi_ns.synthetic.dataset import write_dataset
+        from mmpi_scene.catalogue import make_scene
+        from mmpi_scene.dataset import write_dataset
 
         transforms = self.scene / "transforms.json"
         if transforms.is_file() and len(json.loads(transforms.read_text(encoding="utf-8"))["frames"]) == self.images:

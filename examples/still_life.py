@@ -11,12 +11,12 @@ import numpy as np
 import tyro
 
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic.cameras import Cameras
-from mmpi_ns.synthetic.dataset import write_dataset
-from mmpi_ns.synthetic.indoor import DARK_OAK, OAK
-from mmpi_ns.synthetic.primitives import BEIGE, BROWN, PAINTS, WALLS, WHITE, Kit, look
-from mmpi_ns.synthetic.scene import Light, Scene
-from mmpi_ns.synthetic.surroundings import floor_inside, open_sky
+from mmpi_scene.cameras import Cameras
+from mmpi_scene.dataset import write_dataset
+from mmpi_scene.indoor import DARK_OAK, OAK
+from mmpi_scene.primitives import BEIGE, BROWN, PAINTS, WALLS, WHITE, Kit, look
+from mmpi_scene.scene import Light, Scene
+from mmpi_scene.surroundings import floor_inside, open_sky
 
 
 def still_life(seed: int = 0, count: int = 25, width: int = 240, height: int = 160) -> Scene:

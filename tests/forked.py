@@ -20,7 +20,7 @@ COMMANDS = {
     "ns-render": "nerfstudio.scripts.render",
     "ns-viewer": "nerfstudio.scripts.viewer.run_viewer",
     "mmpi-plan": "mmpi_ns.scripts.plan",
-    "mmpi-scene": "mmpi_ns.scripts.scene",
+    "mmpi-scene": "mmpi_scene.__main__",
     "mmpi-export": "mmpi_ns.scripts.export",
     "mmpi-bench": "mmpi_ns.scripts.bench",
 }

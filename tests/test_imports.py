@@ -16,25 +16,26 @@ METHOD = ["utils", "scene", "ops", "placement", "capture", "field", "rendering",
 """Each may import itself and what comes before it."""
 COMMANDS = {
     "prepare": {"utils", "scene", "placement", "capture"},
-    "synthetic": {"utils"},
     "export": set(METHOD),
     "functional": set(METHOD) | {"export"},
     "": {"functional"},
     "bench": set(METHOD),
-    "scripts": set(METHOD) | {"export", "prepare", "synthetic", "bench"},
+    "scripts": set(METHOD) | {"export", "prepare", "bench"},
+    "mmpi_scene": {"utils", "scripts"},
 }
-"""The method never imports these."""
+"""The method never imports these, and no other command the package of procedural captures."""
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
 MAY_IMPORT |= {wing: others | {wing} for wing, others in COMMANDS.items()}
 
 MODULES = {
     ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path
-    for path in ROOT.rglob("*.py")
+    for folder in (ROOT, ROOT.parent / "mmpi_scene")
+    for path in folder.rglob("*.py")
 }
 
 
 def imported(node: ast.AST, name: str) -> list[str]:
-    """Modules of this package that an import statement reads."""
+    """Modules of our packages that an import statement reads."""
     if isinstance(node, ast.Import):
         found = [alias.name for alias in node.names]
     elif isinstance(node, ast.ImportFrom):
@@ -43,7 +44,7 @@ def imported(node: ast.AST, name: str) -> list[str]:
         found = [each if each in MODULES else str(node.module) for each in inside]
     else:
         found = []
-    return [each for each in found if each.split(".")[0] == "mmpi_ns"]
+    return [each for each in found if each.split(".")[0] in ("mmpi_ns", "mmpi_scene")]
 
 
 def imports(name: str) -> set[str]:
@@ -52,8 +53,8 @@ def imports(name: str) -> set[str]:
 
 
 def wing(name: str) -> str:
-    if name.endswith(".__main__"):  # a command
-        return "scripts"
+    if name.startswith("mmpi_scene"):
+        return "mmpi_scene"
     return name.split(".")[1] if "." in name else ""
 
 
@@ -61,6 +62,11 @@ def wing(name: str) -> str:
 def test_a_module_imports_only_wings_before_its_own(name):
     allowed = MAY_IMPORT.get(wing(name), set())
     assert {wing(each) for each in imports(name)} - {""} <= allowed
+
+
+@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) == "mmpi_scene"))
+def test_procedural_captures_import_no_other_command(name):
+    assert {each for each in imports(name) if wing(each) == "scripts"} <= {"mmpi_ns.scripts.command"}
 
 
 def test_no_import_goes_in_a_circle():

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
-from mmpi_ns.capture.moving_objects import followed, grown, is_static, seeds
+from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
 from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import horizon_of, people_in, upright
@@ -44,11 +45,11 @@ AFTER = 2
 """Nearest neighbours from which objects are followed."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
-SECONDS = 0.7
-"""Processor seconds for an image, for the forecast (docs/results/moving.md)."""
+SECONDS = 0.4
+"""Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is."""
-VERSION = 7
+VERSION = 8
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -153,38 +154,55 @@ def share_of_moving(masks: Sequence[Mask]) -> str:
     )
 
 
-def at_exposure_of(shot: Shot, other: Shot) -> Neighbour:
-    """Another shot with its colours at the exposure of this one, by what both show at one depth."""
-    inverse, parallax = shot.depth.inverse, Parallax.between(shot.view, other.view)
-    x, y, ahead = parallax.pixels(inverse)
-    theirs = look_up(other.depth.inverse, x, y, nearest=True)
-    same = (inverse > 0) & (ahead > 0) & (np.abs(theirs * ahead - inverse) < 0.05 * inverse)
-    rows, columns = np.nonzero(same)
-    if len(rows) < ENOUGH:
-        return Neighbour(other, other.color, parallax)
-    some = np.s_[:: -(-len(rows) // SAMPLES)]
+def gain_of(shot: Shot, other: Shot) -> NDArray[np.float64]:
+    """What the blue, green and red of another shot are multiplied by for the exposure of this one, by what both show
+    at one depth. [3]"""
+    rows, columns = np.nonzero(shot.depth.inverse)
+    some = np.s_[:: max(1, len(rows) // SAMPLES)]
     rows, columns = rows[some], columns[some]
-    theirs = look_up(other.color, x[rows, columns], y[rows, columns])
-    logarithms = [np.log(c + 2.0) for c in (shot.color[rows, columns], theirs)]
-    gain = np.exp(np.median(logarithms[0] - logarithms[1], 0))
-    return Neighbour(other, np.rint(other.color * gain).clip(0, 255).astype(np.uint8), parallax)
+    parallax, inverse = Parallax.between(shot.view, other.view), shot.depth.inverse[rows, columns]
+    right, down, ahead = parallax.linear @ [columns + 0.5, rows + 0.5, np.ones(len(rows))] + np.outer(
+        parallax.b, inverse
+    )
+    ahead = np.where(ahead > 0, ahead, np.nan)
+    x, y = right / ahead, down / ahead
+    theirs = look_up(other.depth.inverse, x, y, nearest=True)
+    same = np.abs(theirs * ahead - inverse) < 0.05 * inverse
+    if np.count_nonzero(same) < ENOUGH:
+        return np.ones(3)
+    theirs = look_up(other.color, x[same], y[same])
+    mine, theirs = (np.log(c + 2.0) for c in (shot.color[rows[same], columns[same]], theirs))
+    return np.exp(np.median(mine - theirs, 0))
+
+
+@dataclass(frozen=True)
+class _First:
+    """What the first pass says of an image whatever moves in others."""
+
+    gains: list[NDArray[np.float64]]
+    """Of its neighbours. [3] each"""
+    swept: Sweep
+    levels: NDArray[np.int16]
+    """Of ``seeds``. [h, w]"""
 
 
 def _moves(
-    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], swept: Sweep | None
-) -> tuple[Mask, Sweep]:
-    """What moves in an image, where it is known what moves in others, and its sweep, which does not depend on that."""
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], first: _First | None
+) -> tuple[Mask, _First]:
+    """What moves in an image, where it is known what moves in others."""
     shot = shots[i]
-    others = [at_exposure_of(shot, shots[j]) for j in near]
-    if swept is None:
-        swept = sweep(shot, others)
-    shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
+    gains = first.gains if first else [gain_of(shot, shots[j]) for j in near]
+    others = [Neighbour.of(shot, shots[j], gain) for j, gain in zip(near, gains, strict=True)]
+    if first is None:
+        first = _First(gains, sweep(shot, others), np.full(shot.view.gray.shape, UNASKED, np.int16))
+    shown = evidence(shot, others, [masks[j] for j in near], first.swept.impossible)
     static = is_static(shot, shown)
-    core = swept.certain & ~static
+    core = first.swept.certain & ~static
     if len(others) >= 2:
-        core |= seeds(shot, others, shown)
+        core |= seeds(shot, others, shown, first.levels)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        flow.setVariationalRefinementIterations(0)
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow) & ~static
-    return grown(shot, shown, core), swept
+    return grown(shot, shown, core), first

@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.dense import Depth, Parallax
-from mmpi_ns.capture.views import Map, View, look_up, pixel_grid
+from mmpi_ns.capture.views import Map, View, pixel_grid
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 SAME = 12
 """Levels by which colours of one surface differ, beyond the range of colours of the pixels around."""
+SPARSE = 2
+"""Side of the squares of pixels of which one gives its depth to another image, and which get one depth."""
 SOLID = 0.75
 """Inverse depths below this multiple of the ground's lie below the ground."""
 SLOPE = 0.05
@@ -122,17 +124,19 @@ def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:
 
 
 def splat(shot: Shot, other: Shot) -> Map:
-    """Inverse depths at the pixels of a shot from those of another one, the nearest of several on one. [h, w]"""
+    """Inverse depths at the pixels of a shot from those of another one, the nearest of several in a square. [h, w]"""
     height, width = shot.view.gray.shape
-    x, y, ahead = Parallax.between(other.view, shot.view).pixels(other.depth.inverse)
-    inverse = np.where(ahead > 0, other.depth.inverse / np.where(ahead > 0, ahead, 1), 0)
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (inverse > 0)
-    result = np.zeros(height * width, np.float32)
-    np.maximum.at(result, y[inside].astype(int) * width + x[inside].astype(int), inverse[inside])
-    result = result.reshape(height, width)
-    for _ in range(2):
-        result = np.where(result > 0, result, cv2.dilate(result, np.ones((3, 3), np.uint8)))
-    return result
+    every = np.s_[::SPARSE, ::SPARSE]
+    known = np.nonzero(other.depth.inverse[every])
+    inverse, parallax = other.depth.inverse[every][known], Parallax.between(other.view, shot.view)
+    a, b, (y, x) = parallax.linear.astype(np.float32), parallax.b, (SPARSE * c.astype(np.float32) + 0.5 for c in known)
+    right, down, ahead = (m[0] * x + m[1] * y + (m[2] + inverse * shift) for m, shift in zip(a, b, strict=True))
+    shown = (ahead > 0) & (right >= 0) & (right < width * ahead) & (down >= 0) & (down < height * ahead)
+    right, down, ahead, inverse = (part[shown] for part in (right, down, SPARSE * ahead, inverse))
+    result = np.zeros((-(-height // SPARSE), -(-width // SPARSE)), np.float32)
+    np.maximum.at(result, ((down / ahead).astype(int), (right / ahead).astype(int)), SPARSE * inverse / ahead)
+    result = np.where(result > 0, result, cv2.dilate(result, np.ones((3, 3), np.uint8)))
+    return np.repeat(np.repeat(result, SPARSE, 0), SPARSE, 1)[:height, :width]
 
 
 def nearest_known(inverse: Map) -> Map:
@@ -161,55 +165,111 @@ def possible_depths(shot: Shot, others: Sequence[Neighbour]) -> tuple[list[Map],
 
 
 @dataclass(frozen=True)
+class Warp:
+    """Where another image shows the pixels of a shot, as OpenCV counts: from the middle of the first one."""
+
+    far: list[Map]
+    """Homogeneous pixels of what is infinitely far. [h, w] each"""
+    shifts: list[float]
+    """Their change for each unit of inverse depth."""
+
+    @staticmethod
+    def between(view: View, other: View) -> Warp:
+        parallax, middle = Parallax.between(view, other), np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+        y, x = (np.arange(n) + 0.5 for n in view.gray.shape)
+        far = [np.add.outer(a[1] * y + a[2], a[0] * x, dtype=np.float32) for a in middle @ parallax.linear]
+        return Warp(far, (middle @ parallax.b).tolist())
+
+    def at(self, pixels: tuple[NDArray[np.intp], ...], times: int) -> Warp:
+        """Of some pixels, in so many equal rows."""
+        return Warp([np.repeat(far[pixels][None], times, 0) for far in self.far], self.shifts)
+
+    def places(self, inverse: Map) -> tuple[Map, Map, Map]:
+        """Pixels x and y at these inverse depths, and depths over those in the shot, at most 0 behind the camera, where
+        the pixels mean nothing. [h, w] each"""
+        right, down, ahead = (
+            np.asarray(cv2.scaleAdd(inverse, shift, far), np.float32)
+            for shift, far in zip(self.shifts, self.far, strict=True)
+        )
+        return right / ahead, down / ahead, ahead
+
+
+@dataclass(frozen=True)
 class Neighbour:
     """Another image as it is compared with a shot."""
 
     shot: Shot
     color: Bytes
     """At the exposure of the shot. [h, w, 3]"""
-    parallax: Parallax
+    warp: Warp
     """From the shot."""
+
+    @staticmethod
+    def of(shot: Shot, other: Shot, gain: NDArray[np.float64] | float = 1.0) -> Neighbour:
+        """Another image, its blue, green and red times a gain. [3]"""
+        levels = np.rint(np.arange(256)[:, None] * np.broadcast_to(gain, 3)).clip(0, 255).astype(np.uint8)
+        color = np.asarray(cv2.LUT(other.color, levels[:, None]), np.uint8)
+        return Neighbour(other, color, Warp.between(shot.view, other.view))
+
+    def with_still(self, moves: Mask | None) -> Bytes:
+        """Its colours, and ALL inside the lens where nothing moves as far as is known, else 0. [h, w, 4]"""
+        still = self.shot.view.inside if moves is None else self.shot.view.inside & ~moves
+        layer = np.asarray(cv2.cvtColor(self.color, cv2.COLOR_BGR2BGRA), np.uint8)
+        layer[..., 3] = 0
+        layer[1:-1, 1:-1, 3][still[1:-1, 1:-1]] = ALL
+        return layer
 
 
 def _compare(
-    shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], inverse: Map, pairs: bool
+    shot: Shot, others: Sequence[Neighbour], layers: Sequence[Bytes], inverse: Map, pairs: bool
 ) -> tuple[list[Bytes], Bytes]:
-    """A shot against its neighbours at some inverse depths.
+    """A shot against its neighbours, with what stands still as a fourth channel, at some inverse depths.
 
     Returns:
         Levels by which the colours of each neighbour differ, ALL where it shows nothing. [h, w] each
         Levels by which the shot differs from both of two neighbours that agree and have nothing in front. [h, w]
     """
-    kernel, three = np.ones((3, 3), np.uint8), shot.color
+    kernel, four = np.ones((3, 3), np.uint8), cv2.cvtColor(shot.color, cv2.COLOR_BGR2BGRA)
+    nearest, farthest = OCCLUDES * inverse, inverse / OCCLUDES
     distances, warped, free = [], [], []
-    for other, mask in zip(others, masks, strict=True):
-        x, y, ahead = other.parallax.pixels(inverse)
-        height, width = other.shot.view.gray.shape
-        inside = (x > 1) & (x < width - 1) & (y > 1) & (y < height - 1) & (ahead > 0)
-        still = other.shot.view.inside if mask is None else other.shot.view.inside & ~mask
-        inside &= look_up(np.ascontiguousarray(still, np.uint8), x, y, nearest=True) > 0
-        there = look_up(other.color, x, y)
+    for other, layer in zip(others, layers, strict=True):
+        x, y, ahead = other.warp.places(inverse)
+        there = cv2.remap(layer, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        inside = (cv2.extractChannel(there, 3) > 0) & (ahead > 0)
         low, high = cv2.erode(there, kernel), cv2.dilate(there, kernel)
-        apart = most_of_channels(cv2.max(cv2.subtract(low, three), cv2.subtract(three, high)))
-        apart = np.asarray(cv2.blur(np.minimum(apart, CLEARLY), (WINDOW, WINDOW)))
-        distances.append(np.where(inside, apart, ALL).astype(np.uint8))
+        apart = most_of_channels(cv2.max(cv2.subtract(low, four), cv2.subtract(four, high)))
+        _, apart = cv2.threshold(apart, CLEARLY, CLEARLY, cv2.THRESH_TRUNC)
+        distances.append(np.asarray(cv2.blur(apart, (WINDOW, WINDOW)), np.uint8) | all_where(~inside))
         if pairs:
-            theirs = look_up(other.shot.around, x, y, nearest=True) * ahead
-            free.append(inside & (theirs <= OCCLUDES * inverse) & (theirs * OCCLUDES >= inverse))
+            theirs = cv2.multiply(cv2.remap(other.shot.around, x, y, cv2.INTER_NEAREST), ahead)
+            free.append(inside & (theirs <= nearest) & (theirs >= farthest))
             warped.append(there)
     pair = np.zeros(inverse.shape, np.uint8)
     for a in range(len(warped)):
         for b in range(max(0, a - 2), a):
             agree = free[a] & free[b] & (most_of_channels(cv2.absdiff(warped[a], warped[b])) < SAME)
-            away = cv2.min(distances[a], distances[b])
-            pair = np.maximum(pair, np.where(agree, away, 0)).astype(np.uint8)
+            pair = np.maximum(pair, all_where(agree) & np.minimum(distances[a], distances[b]))
     return distances, pair
 
 
 def most_of_channels(apart: NDArray[Any]) -> Bytes:
-    """The largest of three channels; NumPy takes three times as long. [h, w]"""
-    blue, green, red = cv2.split(apart)
+    """The largest of the first three channels; NumPy takes three times as long. [h, w]"""
+    blue, green, red = cv2.split(apart)[:3]
     return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
+
+
+def all_where(mask: Mask) -> Bytes:
+    """ALL where a mask is set, else 0; np.where takes ten times as long. [h, w]"""
+    return mask.view(np.uint8) * np.uint8(ALL)
+
+
+def two_least(levels: Sequence[Bytes]) -> tuple[Bytes, Bytes]:
+    """The least and the second least of several, ALL where there is none. [h, w] each"""
+    first, second = np.full((2, *levels[0].shape), ALL, np.uint8)
+    for each in levels:
+        second = np.minimum(second, np.maximum(first, each))
+        first = np.minimum(first, each)
+    return first, second
 
 
 def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], impossible: Mask) -> Evidence:
@@ -226,27 +286,24 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
         nothing = np.zeros(shape, np.uint8)
         return Evidence(nothing, nothing, nothing, 0.0)
     one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
+    layers = [other.with_still(mask) for other, mask in zip(others, masks, strict=True)]
     mine, surfaces = possible_depths(shot, others)
     for n, inverse in enumerate(mine + surfaces):
-        distances, pair = _compare(shot, others, masks, inverse, n >= len(mine))
+        distances, pair = _compare(shot, others, layers, inverse, n >= len(mine))
         possible = inverse > 0
         if shot.ground is not None:
             possible &= inverse >= SOLID * shot.ground
-        first, second = np.full((2, *shape), ALL, np.uint8)
-        for distance in distances:
-            second = cv2.min(second, cv2.max(first, distance))
-            first = cv2.min(first, distance)
-        for least, of_depth in ((one, first), (two, second)):
-            np.minimum(least, of_depth, out=least, where=possible)
-        np.maximum(behind, pair, out=behind, where=possible)
+        first, second = (levels | all_where(~possible) for levels in two_least(distances))
+        one, two = np.minimum(one, first), np.minimum(two, second)
+        behind = np.maximum(behind, pair & all_where(possible))
     # Nobody can tell where fewer than two neighbours would show even the nearest content.
     measured = shot.depth.inverse[shot.depth.inverse > 0]
     nearest = np.full(shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
     showing = np.zeros(shape, np.uint8)
     for other in others:
-        x, y, ahead = other.parallax.pixels(nearest)
+        x, y, ahead = other.warp.places(nearest)
         height, width = other.shot.view.gray.shape
-        showing += (x > 0) & (x < width) & (y > 0) & (y < height) & (ahead > 0)
+        showing += (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5) & (ahead > 0)
     decided = (showing >= 2) & shot.view.inside
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)

@@ -12,16 +12,30 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
-from mmpi_ns.capture.moving_evidence import ALL, SOLID, Evidence, Mask, Neighbour, Shot
+from mmpi_ns.capture.dense import correlation, mean_and_contrast
+from mmpi_ns.capture.moving_evidence import (
+    ALL,
+    SOLID,
+    Evidence,
+    Mask,
+    Neighbour,
+    Shot,
+    Warp,
+    all_where,
+    most_of_channels,
+    two_least,
+)
 from mmpi_ns.capture.views import look_up, pixel_grid
 
 LEAST_LEVELS, NOISES = 12.0, 4.0
 """Levels of strong evidence from which a pixel is a seed: the first, plus this multiple of the image's noise."""
 WEAKER = 1.3
 """Times as many levels of weak evidence make a seed."""
-STEPS, REACH = 48, 1.2
-"""Inverse depths at which seeds are searched in the neighbours, up to this multiple of the nearest content's."""
+STEPS, PARTS, REACH = 48, 4, 1.2
+"""Inverse depths at which seeds are searched in the neighbours, in so many parts, up to this multiple of the nearest
+content's."""
+UNASKED = -1
+"""Instead of the levels of a pixel that was no candidate so far."""
 DENSITY, AROUND = 0.35, 7
 """Share of seeds in a window of this many pixels around a seed that is kept."""
 LEAST_PIXELS, LEAST_SIDE = 20, 4
@@ -39,24 +53,29 @@ CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
 STATIC = 0.5
 """Share of static pixels from which what looks like a person is none."""
-ITERATIONS = 3
-"""Of GrabCut."""
+ITERATIONS, LARGE = 3, 4000
+"""Of GrabCut, and pixels from which on it is done at half the size."""
 FOLLOWED = 0.7
 """Correlation with the neighbour from which an object is followed."""
 
 
-def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence) -> Mask:
-    """Pixels that show something that moves, beyond doubt. [h, w]"""
+def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence, levels: NDArray[np.int16]) -> Mask:
+    """Pixels that show something that moves, beyond doubt. [h, w]
+
+    ``levels`` are those of ``unexplained`` where it has been asked, else UNASKED, and are written to. [h, w]
+    """
     least = LEAST_LEVELS + NOISES * evidence.noise
     candidates = (evidence.strong > least) | (evidence.weak > WEAKER * least)
-    result = candidates.copy()
-    result[candidates] = unexplained(shot, others, candidates) > least
+    unasked = candidates & (levels == UNASKED)
+    levels[unasked] = unexplained(shot, others, unasked)
+    result = candidates & (levels > least)
     share = cv2.boxFilter(result.astype(np.float32), -1, (AROUND, AROUND))
     return result & (share > DENSITY)
 
 
 def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> NDArray[np.uint8]:
-    """Levels by which some pixels differ from all neighbours but one, at the depth where they differ least. [P]
+    """Levels by which some pixels differ from all neighbours but one, at the depth where they differ least; where that
+    is below what a seed needs, at some depth. [P]
 
     0 where two neighbours show nothing at one of the depths: nobody can tell.
     """
@@ -64,27 +83,29 @@ def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> ND
     measured = shot.depth.inverse[shot.depth.inverse > 0]
     if not len(rows) or not len(measured):
         return np.zeros(len(rows), np.uint8)
-    inverse = np.linspace(0, REACH * np.percentile(measured, 98), STEPS, dtype=np.float32)[:, None]
-    if shot.ground is not None:
-        inverse = np.maximum(inverse, SOLID * shot.ground[rows, columns])
-    color, kernel = shot.color[rows, columns].astype(np.int16), np.ones((3, 3), np.uint8)
-    distances = []
-    for other in others:
-        right, down, ahead = (
-            (m[0] * (columns + 0.5) + m[1] * (rows + 0.5) + m[2]).astype(np.float32) + inverse * b
-            for m, b in zip(other.parallax.linear, other.parallax.b, strict=True)
-        )
-        height, width = other.shot.view.gray.shape
-        ahead = np.where(ahead > 1e-6, ahead, np.nan)
-        with np.errstate(invalid="ignore"):
-            inside = (right >= ahead) & (right < (width - 1) * ahead) & (down >= ahead) & (down < (height - 1) * ahead)
-        x, y = (np.where(inside, part / ahead, 0).astype(np.int32) for part in (right, down))
-        low, high = cv2.erode(other.color, kernel)[y, x].astype(np.int16), cv2.dilate(other.color, kernel)[y, x]
-        apart = np.maximum(low - color, color - high).max(-1).clip(0, ALL - 1)
-        distances.append(np.where(inside, apart, ALL).astype(np.uint8))
-    ordered = np.sort(np.stack(distances), 0)
-    seen = (ordered[1] < ALL).all(0)
-    return np.where(seen, ordered[1].min(0), 0).astype(np.uint8)
+    steps = np.linspace(0, REACH * np.percentile(measured, 98), STEPS, dtype=np.float32)[:, None]
+    kernel, layers = np.ones((3, 3), np.uint8), [other.with_still(None) for other in others]
+    ranges = [(cv2.erode(layer, kernel), cv2.dilate(layer, kernel)) for layer in layers]
+    levels, left = np.full(len(rows), ALL, np.uint8), np.arange(len(rows))
+    for part in range(PARTS):
+        at = rows[left], columns[left]
+        inverse = np.repeat(steps[part::PARTS], len(left), 1)
+        if shot.ground is not None:
+            inverse = np.maximum(inverse, SOLID * shot.ground[at])
+        color = np.repeat(cv2.cvtColor(shot.color[at][None], cv2.COLOR_BGR2BGRA), len(inverse), 0)
+        distances = []
+        for other, (low, high) in zip(others, ranges, strict=True):
+            x, y, ahead = other.warp.at(at, len(inverse)).places(inverse)
+            low, high = (look_up(image, x + 0.5, y + 0.5, nearest=True) for image in (low, high))
+            apart = most_of_channels(cv2.max(cv2.subtract(low, color), cv2.subtract(color, high)))
+            shown = (cv2.extractChannel(high, 3) > 0) & (ahead > 0)
+            distances.append(np.minimum(apart, np.uint8(ALL - 1)) | all_where(~shown))
+        _, second = two_least(distances)
+        levels[left] = np.minimum(levels[left], np.where((second < ALL).all(0), second.min(0), 0))
+        left = left[levels[left] > LEAST_LEVELS]
+        if not len(left):
+            break
+    return levels
 
 
 def is_static(shot: Shot, evidence: Evidence) -> Mask:
@@ -126,20 +147,13 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
 def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int], body: int) -> Mask:
     """The object that covers some pixels for certain and others in its room perhaps."""
     height, (left, top, right, bottom) = len(part), room
-    box = np.zeros_like(part)
-    box[max(0, top) : bottom, max(0, left) : right] = True
-    labels = np.full(part.shape, cv2.GC_BGD, np.uint8)
-    labels[box & ~static] = cv2.GC_PR_FGD
-    labels[part] = cv2.GC_FGD
     margin = max(8, round(0.3 * max(right - left, bottom - max(0, top))))
     inside = np.s_[max(0, top - margin) : bottom + margin, max(0, left - margin) : right + margin]
-    cut = np.ascontiguousarray(labels[inside])
-    cv2.setRNGSeed(0)
-    if (cut == cv2.GC_BGD).any():
-        models = np.zeros((1, 65)), np.zeros((1, 65))
-        cv2.grabCut(np.ascontiguousarray(shot.color[inside]), cut, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
-    result = np.zeros_like(part)
-    result[inside] = (cut == cv2.GC_FGD) | (cut == cv2.GC_PR_FGD)
+    perhaps = np.zeros_like(part)
+    perhaps[max(0, top) : bottom, max(0, left) : right] = True
+    perhaps &= ~static
+    result = part.copy()
+    result[inside] |= perhaps[inside] & _cut(shot.color[inside], part[inside], perhaps[inside])
     # The colours of an object may be those around it; what stands in the columns above its seeds is its body.
     columns_of = part.any(0)
     first, last = part.argmax(0), height - 1 - part[::-1].argmax(0)
@@ -149,6 +163,24 @@ def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int
     _, labels = cv2.connectedComponents(closed)
     whole = without_holes(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])))
     return whole if part.sum() > CORE * whole.sum() else np.zeros_like(whole)
+
+
+def _cut(color: NDArray[np.uint8], surely: Mask, perhaps: Mask) -> Mask:
+    """What GrabCut takes for an object; at half the size if it is large. [h, w]"""
+    size = color.shape[1::-1]
+    if surely.size > LARGE:
+        size = size[0] // 2, size[1] // 2
+    small, part, room = (
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        for image in (color, surely.astype(np.uint8) * ALL, perhaps.astype(np.uint8) * ALL)
+    )
+    labels = np.where(part > 0, cv2.GC_FGD, np.where(room > ALL // 2, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(np.uint8)
+    if (labels == cv2.GC_BGD).any():
+        cv2.setRNGSeed(0)
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(small, labels, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
+    objects = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.float32)
+    return cv2.resize(objects, surely.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def without_holes(mask: Mask) -> Mask:
@@ -164,8 +196,9 @@ def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> M
     Both look the same way first: optical flow finds what is near the same pixel, and turning the head shifts all.
     """
     gray = shot.view.gray
-    x, y, _ = Parallax.between(shot.view, other.view).pixels(np.zeros(gray.shape, np.float32))
-    turned, moves = look_up(other.view.gray, x, y), look_up(mask.astype(np.uint8), x, y, nearest=True)
+    x, y, ahead = Warp.between(shot.view, other.view).places(np.zeros(gray.shape, np.float32))
+    moves = cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST) * (ahead > 0)
+    turned = np.asarray(cv2.remap(other.view.gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     there = np.asarray(flow.calc(gray, turned, None))  # type: ignore[call-overload]
     back = np.asarray(flow.calc(turned, gray, None))  # type: ignore[call-overload]
     x, y = pixel_grid(gray.shape)

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
-from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
+from mmpi_ns.capture.dense import correlation, mean_and_contrast
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, Warp
 from mmpi_ns.capture.views import Map, View
 
 NEIGHBOURS = 4
@@ -63,9 +62,11 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
     nothing, measured = np.zeros(shot.view.gray.shape, bool), shot.depth.inverse[shot.depth.inverse > 0]
     if shot.ground is None or not len(measured) or len(others) < 2:
         return Sweep(nothing, nothing)
-    view, largest = halved(shot.view), REACH * float(np.percentile(measured, 98))
+    view, largest = shot.view.reduced(2), REACH * float(np.percentile(measured, 98))
     ground = np.asarray(cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
-    inverse, below = _at_all_depths(view, [halved(other.shot.view) for other in others[:NEIGHBOURS]], ground, largest)
+    inverse, below = _at_all_depths(
+        view, [other.shot.view.reduced(2) for other in others[:NEIGHBOURS]], ground, largest
+    )
     views = [shot.view, *(other.shot.view for other in others)]
     air = floats(inverse, ground) if is_straight(views) else np.zeros_like(below)
     below, air = (
@@ -76,27 +77,24 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
     return Sweep(below > 0, (inner | air) > 0)
 
 
-def halved(view: View) -> View:
-    """A view at half its size."""
-    height, width = (n // 2 for n in view.gray.shape)
-    scale = np.array([width / view.gray.shape[1], height / view.gray.shape[0]] * 2)
-    inside = cv2.resize(view.inside.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    gray = cv2.resize(view.gray, (width, height), interpolation=cv2.INTER_AREA)
-    return View(np.asarray(gray, np.uint8), view.pinhole * scale, view.pose, inside)
-
-
 def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: float) -> tuple[Map, Mask]:
     """The inverse depth at which most is alike, 0 where nothing is, and where only impossible ones are. [h, w] each"""
     shape, of_view = view.gray.shape, mean_and_contrast(view.gray)
-    parallax = [Parallax.between(view, other) for other in others]
+    warps = [Warp.between(view, other) for other in others]
+    grays = [np.where(other.inside, np.maximum(other.gray, 1), 0).astype(np.uint8) for other in others]  # 0: nothing
     least, step = BELOW * ground - MARGIN * largest, largest / POSITIVE
     moves, stands, best = np.full((3, *shape), -1, np.float32)
     inverse, false = np.zeros((2, *shape), np.float32)
     for n in range(-NEGATIVE, POSITIVE + 1):
-        q = n * step
+        q, depths = n * step, np.full(shape, n * step, np.float32)
         first, second = np.full((2, *shape), -1, np.float32)
-        for other, there in zip(others, parallax, strict=True):
-            alike = _alike(view, other, there.linear + np.outer(there.b, np.array([0, 0, q])), of_view)
+        for gray, warp in zip(grays, warps, strict=True):
+            x, y, ahead = warp.places(depths)
+            if ahead.min() <= 0:  # in part behind the other camera
+                continue
+            seen = np.asarray(cv2.remap(gray, x, y, cv2.INTER_LINEAR), np.uint8)
+            alike = correlation(view.gray, seen, of_view)
+            alike[seen == 0] = -1
             second = np.maximum(second, np.minimum(first, alike))
             first = np.maximum(first, alike)
         confirmed = (first + second) / 2
@@ -110,21 +108,6 @@ def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: flo
     coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
     textured = view.inside & (of_view[1] > CONTRAST)
     return inverse, (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
-
-
-def _alike(view: View, other: View, plane: NDArray[np.float64], of_view: tuple[Map, Map]) -> Map:
-    """Correlation with another view through a plane; -1 where it shows nothing. [h, w]"""
-    height, width = view.gray.shape
-    corners = plane[2] @ [[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]]
-    if corners.min() <= 0:  # in part behind the other camera
-        return np.full(view.gray.shape, -1, np.float32)
-    middle = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from the middle of the first pixel
-    places = np.linalg.inv(middle) @ plane @ middle
-    seen, inside = (
-        cv2.warpPerspective(image, places, (width, height), flags=mode | cv2.WARP_INVERSE_MAP)
-        for image, mode in ((other.gray, cv2.INTER_LINEAR), (other.inside.astype(np.uint8), cv2.INTER_NEAREST))
-    )
-    return np.where(inside > 0, correlation(view.gray, np.asarray(seen, np.uint8), of_view), -1)
 
 
 def solid(moves: Mask, ground: Map) -> Mask:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from mmpi_ns.capture.tracks import PosedImages
@@ -21,8 +21,12 @@ SIDE, ENLARGED = 2048, 2.0
 detector finds people from 96 pixels in height."""
 ABOVE, BELOW = 0.12, 0.3
 """Rows that are searched, from above the horizon to below it, in widths of the image."""
-SCORE = 0.6
-"""Of the detector, least."""
+LEVELS, FINER, CELL = 40, 1.1, 8
+"""Sizes that are searched at most, their ratio, and pixels from one window of the detector to the next."""
+TALL, SPARE = 96, 24
+"""Pixels of a person in the detector's window, and beyond those that are searched above and below."""
+SCORE, ALIKE = 0.6, 0.2
+"""Of the detector, least, for one of the windows that show a person alike but for this share of their size."""
 HEIGHTS = (0.6, 1.3)
 """Height of the camera over that of a person."""
 SLOPE = 0.3
@@ -68,17 +72,40 @@ def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) 
     scale = min(ENLARGED, SIDE / max(height, width))
     level = float(horizon.mean()) * height / view.gray.shape[0]
     first, last = (int(np.clip(level + share * width, 0, height)) for share in (-ABOVE, BELOW))
-    size = round(scale * width), round(scale * (last - first))
-    detector = cv2.HOGDescriptor()
-    if size[0] < detector.winSize[0] or size[1] < detector.winSize[1]:
+    if last <= first:
         return nobody
-    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
-    rows = cv2.resize(wide.gray[first:last], size, interpolation=cv2.INTER_LINEAR)
-    windows, scores = detector.detectMultiScale(rows, winStride=(8, 8), scale=1.1, groupThreshold=1)
-    windows = np.asarray(windows, np.float64).reshape(-1, 4)[np.ravel(scores) > SCORE]
+    rows = cv2.resize(wide.gray[first:last], None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
+    windows = _windows(np.asarray(rows, np.uint8), scale * (horizon[[0, -1]] * height / view.gray.shape[0] - first))
     low, extent = windows[:, :2] + MARGIN * windows[:, 2:], (1 - 2 * MARGIN) * windows[:, 2:]
     boxes = (np.concatenate([low, low + extent], -1) / scale + [0, first, 0, first]) * view.gray.shape[0] / height
     camera = (boxes[:, 3] - np.interp(boxes[:, [0, 2]].mean(1), np.arange(len(horizon)) + 0.5, horizon)) / (
         boxes[:, 3] - boxes[:, 1]
     )
     return boxes[(camera > HEIGHTS[0]) & (camera < HEIGHTS[1])].round().astype(int)
+
+
+def _windows(gray: UInt8[ndarray, "H W"], horizon: Float[ndarray, "2"]) -> Float[ndarray, "N 4"]:
+    """Left, top, width and height of the detector's windows around people; the horizon ends at these rows.
+
+    Of each size only the rows are searched that people have in whose height the camera stands.
+    """
+    detector = cv2.HOGDescriptor()
+    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
+    size, windows, scores = detector.winSize, [np.zeros((0, 4))], [np.zeros(0)]
+    for power in range(LEVELS):
+        shrink = FINER**power
+        shape = round(gray.shape[1] / shrink), round(gray.shape[0] / shrink)
+        if shape[0] < size[0] or shape[1] < size[1]:
+            break
+        top = max(0, round(horizon.min() / shrink - (1 - HEIGHTS[0]) * TALL - SPARE) // CELL * CELL)
+        bottom = max(0, round(horizon.max() / shrink + HEIGHTS[1] * TALL + SPARE))
+        part = cv2.resize(gray, shape, interpolation=cv2.INTER_LINEAR_EXACT)[top:bottom]
+        corners, of_level = detector.detect(part, winStride=(CELL, CELL)) if len(part) >= size[1] else ((), ())
+        if len(corners):
+            boxes = np.insert(np.asarray(corners), [2, 2], size, 1)
+            windows.append(np.round((boxes + np.array([0, top, 0, 0])) * shrink))
+            scores.append(np.ravel(of_level))
+    every, score = np.concatenate(windows).astype(int), np.concatenate(scores)
+    grouped = np.reshape(cv2.groupRectangles(every.tolist(), 1, ALIKE)[0], (-1, 4)).astype(np.float64)
+    alike = np.abs(every - grouped[:, None]).max(-1) <= ALIKE * grouped[:, 2:].mean(-1)[:, None]
+    return grouped[np.where(alike, score, 0).max(-1, initial=0) > SCORE]

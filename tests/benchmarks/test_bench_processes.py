@@ -9,8 +9,8 @@ import torch
 from processes import Processes, headline
 
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 import roads
 from roads import Roads, headline, some_windows
 
-from mmpi_ns.synthetic import catalogue
+from mmpi_scene import catalogue
 
 SMALL = {"count": 61, "width": 160, "height": 48}
 """Images of the road, which take longer to draw than to learn."""

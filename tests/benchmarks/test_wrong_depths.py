@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 from wrong_depths import AHEAD, TOO_FAR, write_with_wrong_depths, wrong_distances
 
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset
-from mmpi_ns.synthetic.scene import render
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset
+from mmpi_scene.scene import render
 
 
 @pytest.fixture(scope="module")

@@ -15,14 +15,24 @@ from training_runs import datamanager
 from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.capture.dense import Depth, Parallax
-from mmpi_ns.capture.moving import find_moving, in_image
+from mmpi_ns.capture.moving import find_moving, gain_of, in_image
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, ground_of, nearest_known, splat
-from mmpi_ns.capture.moving_objects import followed, grown, unexplained, without_holes
+from mmpi_ns.capture.moving_objects import (
+    LEAST_LEVELS,
+    REACH,
+    STEPS,
+    UNASKED,
+    followed,
+    grown,
+    seeds,
+    unexplained,
+    without_holes,
+)
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View, camera_matrix
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset
-from mmpi_ns.synthetic.movers import MOVER, with_movers
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset
+from mmpi_scene.movers import MOVER, with_movers
 
 SIZE = (60, 80)
 PINHOLE = np.array([70.0, 70.0, 40.0, 30.0])
@@ -76,15 +86,18 @@ def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed
     """One row: swept, followed, a seed, each with a static pixel and one that is not."""
     swept, followed_pixels, seed, static = (np.zeros((1, 6), bool) for _ in range(4))
     swept[0, :2] = followed_pixels[0, 2:4] = seed[0, 4:] = static[0, ::2] = True
+    monkeypatch.setattr(moving.Neighbour, "of", lambda *_: None)
     sweeps = moving.Sweep(swept, swept)
     for name, value in (
-        ("at_exposure_of", None), ("sweep", sweeps), ("evidence", None), ("is_static", static), ("seeds", seed),
+        ("gain_of", None), ("sweep", sweeps), ("evidence", None), ("is_static", static), ("seeds", seed),
         ("followed", followed_pixels),
     ):  # fmt: skip
         monkeypatch.setattr(moving, name, lambda *_, value=value: value)
     monkeypatch.setattr(moving, "grown", lambda shot, shown, core: core)
     masks = [np.ones((1, 6), bool)] * 3
-    core, _ = moving._moves([None] * 3, [1, 2], 0, masks, None)  # type: ignore[list-item]
+    nothing = Depth(*np.zeros((2, 1, 6), np.float32))
+    shot = Shot(View(np.zeros((1, 6), np.uint8), np.ones(4), np.eye(4)[:3], static), np.zeros((1, 6, 3)), nothing, None)
+    core, _ = moving._moves([shot] * 3, [1, 2], 0, masks, None)
     assert core[0].tolist() == [False, True, False, True, True, True]
 
 
@@ -154,7 +167,7 @@ def textured(seed, shape=SIZE, grain=1.5):
 
 
 def neighbours(shot, *others):
-    return [Neighbour(other, other.color, Parallax.between(shot.view, other.view)) for other in others]
+    return [Neighbour.of(shot, other) for other in others]
 
 
 def test_a_wall_is_explained_by_its_depth_and_another_picture_is_not():
@@ -166,6 +179,58 @@ def test_a_wall_is_explained_by_its_depth_and_another_picture_is_not():
     assert np.median(unexplained(shots[1], neighbours(shots[1], shots[0], shots[2]), middle)) < 12
     strange = a_shot(0.0, textured(1), inverse)
     assert np.median(unexplained(strange, neighbours(strange, shots[0], shots[2]), middle)) > 20
+
+
+def least_levels(shot, others, row, column, steps):
+    """Of one pixel, in float64, depth by depth and neighbour by neighbour."""
+    color, best = shot.color[row, column].astype(int), 255
+    for q in steps:
+        levels = []
+        for other in others:
+            parallax = Parallax.between(shot.view, other.view)
+            at = parallax.linear @ [column + 0.5, row + 0.5, 1] + q * parallax.b
+            x, y = (int(np.floor(c / at[2])) for c in at[:2])
+            if not (0 <= x < SIZE[1] and 0 <= y < SIZE[0]):
+                continue
+            window = other.color[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].reshape(-1, 3).astype(int)
+            levels.append(np.maximum(window.min(0) - color, color - window.max(0)).max().clip(0, 254))
+        if len(levels) < 2:
+            return 0
+        best = min(best, sorted(levels)[1])
+    return best
+
+
+def test_levels_are_those_of_every_depth_or_fewer_than_a_seed_needs():
+    others = [a_shot(0.5 * k, textured(k + 5), 0.5) for k in (-2, -1, 1)]
+    shot = a_shot(0.0, textured(1), 0.5)
+    candidates = np.zeros(SIZE, bool)
+    candidates[5::11, ::9] = True
+    levels = unexplained(shot, neighbours(shot, *others), candidates)
+    steps = np.linspace(0, REACH * 0.5, STEPS)
+    slow = np.array([least_levels(shot, others, *at, steps) for at in np.argwhere(candidates)])
+    few = slow <= LEAST_LEVELS
+    assert 0.2 < few.mean() < 0.8
+    assert (levels[few] <= LEAST_LEVELS).mean() > 0.95 and (levels[~few] == slow[~few]).mean() > 0.95
+
+
+def test_levels_are_asked_once_and_are_those_of_a_single_time():
+    others = [a_shot(0.1 * k, textured(k + 5), 0.5) for k in (-2, -1, 1)]
+    shot, levels = a_shot(0.0, textured(1), 0.5), np.full(SIZE, UNASKED, np.int16)
+    strong, nothing = np.zeros(SIZE, np.uint8), np.zeros(SIZE, np.uint8)
+    for left in (20, 60):
+        strong[10:40, 10:left] = 255
+        twice = seeds(shot, neighbours(shot, *others), Evidence(strong, nothing, nothing, 0.0), levels)
+    afresh = np.full(SIZE, UNASKED, np.int16)
+    once = seeds(shot, neighbours(shot, *others), Evidence(strong, nothing, nothing, 0.0), afresh)
+    assert once.any() and (twice == once).all() and (levels == afresh).all()
+
+
+def test_an_image_of_another_exposure_is_brought_to_that_of_the_shot():
+    wide = textured(0, (60, 120))
+    shot, other = (a_shot(0.1 * k, np.ascontiguousarray(wide[:, 10 + round(3.5 * k) :][:, :80]), 0.5) for k in (0, 2))
+    darker = replace(other, color=np.rint(other.color * [0.5, 0.7, 0.8]).astype(np.uint8))
+    np.testing.assert_allclose(gain_of(shot, darker), [2, 1 / 0.7, 1.25], rtol=0.05)
+    np.testing.assert_allclose(Neighbour.of(shot, darker, gain_of(shot, darker)).color, other.color, atol=12)
 
 
 def test_what_two_neighbours_would_not_show_is_not_judged():

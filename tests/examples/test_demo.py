@@ -28,7 +28,7 @@ from views import load_run, render_alone, render_view, truth_of
 
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scripts.command import run as run_command
-from mmpi_ns.synthetic import dataset
+from mmpi_scene import dataset
 
 
 @pytest.fixture(scope="module")

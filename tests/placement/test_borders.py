@@ -12,7 +12,7 @@ from still_life import still_life
 from mmpi_ns.placement.rule import WIDEST, PlacementConfig, border_points, place, widened
 from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import MPIPlan
-from mmpi_ns.synthetic.catalogue import make_scene
+from mmpi_scene.catalogue import make_scene
 
 
 def holds(mpi: MPIPlan, points: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
-from mmpi_ns.synthetic.catalogue import make_scene
+from mmpi_scene.catalogue import make_scene
 
 CONFIG = PlacementConfig(max_texels=0, max_voxels=128)
 """As fine as asked, and with cubes where they look worth it."""

@@ -18,9 +18,9 @@ from mmpi_ns.placement.show import describe_facing, explain, table
 from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.plan import _defaults, entrypoint
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset
 from mmpi_ns.utils.errors import InputError
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset
 
 
 def run(monkeypatch, *words):

@@ -10,9 +10,9 @@ import pytest
 
 from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.synthetic.catalogue import make_scene
-from mmpi_ns.synthetic.dataset import write_dataset
-from mmpi_ns.synthetic.movers import MOVER, with_movers
+from mmpi_scene.catalogue import make_scene
+from mmpi_scene.dataset import write_dataset
+from mmpi_scene.movers import MOVER, with_movers
 
 
 @pytest.fixture(scope="module")

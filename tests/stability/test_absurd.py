@@ -16,8 +16,8 @@ from still_life import still_life
 
 from mmpi_ns.bench.trainers import Scene, config_of, train_words, trainer_of
 from mmpi_ns.scene.plan import MPIPlan
-from mmpi_ns.synthetic.dataset import write_dataset
 from mmpi_ns.training.trainer import MMPITrainer
+from mmpi_scene.dataset import write_dataset
 
 WIDTH, HEIGHT, IMAGES = 32, 24, 9
 RAYS = 64

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmpi_ns.scripts.scene import SceneCommand
-from mmpi_ns.synthetic import make_scene, render, sfm_points
-from mmpi_ns.synthetic.dataset import Exposure, light_of, make_exposure, tone
-from mmpi_ns.synthetic.movers import MOVER, moving_mask, with_movers
+from mmpi_scene import make_scene, render, sfm_points
+from mmpi_scene.__main__ import SceneCommand
+from mmpi_scene.dataset import Exposure, light_of, make_exposure, tone
+from mmpi_scene.movers import MOVER, moving_mask, with_movers
 
 FRAMES = {"count": 16, "width": 96, "height": 54, "length": 12.0}
 

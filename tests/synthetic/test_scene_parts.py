@@ -9,8 +9,8 @@ import pycolmap
 import pytest
 from procedural import keypoint_errors
 
-from mmpi_ns.synthetic import Scene, make_scene, sfm_points, write_dataset
-from mmpi_ns.synthetic.primitives import BOX, SPHERE, Kit, Tracer
+from mmpi_scene import Scene, make_scene, sfm_points, write_dataset
+from mmpi_scene.primitives import BOX, SPHERE, Kit, Tracer
 
 
 @pytest.fixture(scope="module")

@@ -13,14 +13,14 @@ from procedural import keypoint_errors
 from reprojection import median_reprojection_error
 
 from mmpi_ns.capture.sfm import find_sfm_model
-from mmpi_ns.scripts.scene import SceneCommand
-from mmpi_ns.synthetic import SCENES, Cameras, Scene, make_scene, render, sfm_points, write_dataset
-from mmpi_ns.synthetic.dataset import PARTS
-from mmpi_ns.synthetic.materials import Noise, pulse
-from mmpi_ns.synthetic.primitives import Kit, look
-from mmpi_ns.synthetic.road import Road
-from mmpi_ns.synthetic.scene import Light
-from mmpi_ns.synthetic.surroundings import meadow, open_sky
+from mmpi_scene import SCENES, Cameras, Scene, make_scene, render, sfm_points, write_dataset
+from mmpi_scene.__main__ import SceneCommand
+from mmpi_scene.dataset import PARTS
+from mmpi_scene.materials import Noise, pulse
+from mmpi_scene.primitives import Kit, look
+from mmpi_scene.road import Road
+from mmpi_scene.scene import Light
+from mmpi_scene.surroundings import meadow, open_sky
 
 SMALL = {"count": 6, "width": 64, "height": 32}
 EAST = np.zeros(1)
@@ -211,7 +211,7 @@ def test_what_stands_in_front_hides_a_point():
     open_view = hand_made(kit, cameras=Cameras(poses, 40.0, 64, 48, 2))
     kit.box((5.0, 0, 1.5), (0.2, 0.3, 3.0), "plaster", *grey)
     hidden = replace(open_view, primitives=kit.done())
-    from mmpi_ns.synthetic.sfm_like import visible
+    from mmpi_scene.sfm_like import visible
 
     point = np.array([[9.5, 0.0, 1.5], [9.5, 3.0, 1.5]])
     assert [visible(open_view, i, point)[0].tolist() for i in range(5)] == [[True, True]] * 5
@@ -345,7 +345,7 @@ def test_colmap_model_has_the_cameras_and_the_errors_it_states(dataset, street):
 
 
 def test_a_folder_in_use_is_left_as_it_is(tmp_path, monkeypatch, capsys):
-    from mmpi_ns.scripts import scene as script
+    from mmpi_scene import __main__ as script
 
     folder = tmp_path / "out"
     folder.mkdir()

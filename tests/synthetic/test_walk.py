@@ -10,7 +10,7 @@ import pytest
 import torch
 from procedural import keypoint_errors
 
-from mmpi_ns.synthetic import make_scene, sfm_points, write_dataset
+from mmpi_scene import make_scene, sfm_points, write_dataset
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_several_processes_write_the_same_files(walk, folder, tmp_path):
 
 
 def test_an_image_that_cannot_be_written_ends_all_processes(walk, tmp_path, monkeypatch):
-    from mmpi_ns.synthetic import dataset
+    from mmpi_scene import dataset
 
     monkeypatch.setattr(dataset, "image_name", lambda camera: f"{camera}.nothing" if camera == 3 else f"{camera}.png")
     with pytest.raises(ValueError, match="unknown file extension"):

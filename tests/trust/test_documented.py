@@ -20,9 +20,9 @@ def template(node):
 
 
 def parsed(but=""):
-    """The modules of the package, but for those of one folder."""
-    paths = [path for path in (ROOT / "mmpi_ns").rglob("*.py") if path.parent.name != but]
-    return [ast.parse(path.read_text(encoding="utf-8")) for path in paths]
+    """The modules of both packages, but for those of one folder."""
+    paths = [path for name in ("mmpi_ns", "mmpi_scene") for path in (ROOT / name).rglob("*.py")]
+    return [ast.parse(path.read_text(encoding="utf-8")) for path in paths if path.parent.name != but]
 
 
 def raised(trees):

@@ -11,11 +11,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.synthetic.cameras import Array
-from mmpi_ns.synthetic.primitives import PAINTS, WHITE, Primitives, Tracer
-from mmpi_ns.synthetic.road import Road
-from mmpi_ns.synthetic.scene import Scene, tile_order
-from mmpi_ns.synthetic.street import Street
+from mmpi_scene.cameras import Array
+from mmpi_scene.primitives import PAINTS, WHITE, Primitives, Tracer
+from mmpi_scene.road import Road
+from mmpi_scene.scene import Scene, tile_order
+from mmpi_scene.street import Street
 
 WALKING, DRIVING = 1.3, 8.0
 """Metres a second; whoever films the street walks or drives too."""

@@ -12,8 +12,8 @@ from typing import Literal
 import tyro
 
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic.dataset import ExposureName
 from mmpi_ns.utils.errors import quoted
+from mmpi_scene.dataset import ExposureName
 
 Name = Literal["street", "long-road", "walk", "room", "look-round", "object"]
 
@@ -57,10 +57,10 @@ class SceneCommand:
     def main(self) -> None:
         from rich.progress import track
 
-        from mmpi_ns.synthetic.catalogue import make_scene
-        from mmpi_ns.synthetic.dataset import check_folder, make_exposure, write_dataset
-        from mmpi_ns.synthetic.movers import with_movers
         from mmpi_ns.utils.values import Number, check_options
+        from mmpi_scene.catalogue import make_scene
+        from mmpi_scene.dataset import check_folder, make_exposure, write_dataset
+        from mmpi_scene.movers import with_movers
 
         size = Number(1, 65536, whole=True)
         ranges = {

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.synthetic.materials import ROW
+from mmpi_scene.materials import ROW
 
 Array = NDArray[np.float64]
 Arrays = TypeVar("Arrays", bound=Any)

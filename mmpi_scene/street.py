@@ -6,11 +6,11 @@ from functools import partial
 
 import numpy as np
 
-from mmpi_ns.synthetic.cameras import Cameras
-from mmpi_ns.synthetic.primitives import BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
-from mmpi_ns.synthetic.road import Road
-from mmpi_ns.synthetic.scene import Light, Scene
-from mmpi_ns.synthetic.surroundings import open_sky, street_ground
+from mmpi_scene.cameras import Cameras
+from mmpi_scene.primitives import BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
+from mmpi_scene.road import Road
+from mmpi_scene.scene import Light, Scene
+from mmpi_scene.surroundings import open_sky, street_ground
 
 CAMERA_HEIGHT = 1.65
 SUN = (-0.45, -0.4, 0.8)

@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.synthetic.cameras import Cameras
-from mmpi_ns.synthetic.materials import MATERIALS, Noise, Surface
-from mmpi_ns.synthetic.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, take, to_local
-from mmpi_ns.synthetic.road import Road
+from mmpi_scene.cameras import Cameras
+from mmpi_scene.materials import MATERIALS, Noise, Surface
+from mmpi_scene.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, take, to_local
+from mmpi_scene.road import Road
 
 Colors = NDArray[np.float32]
 Ground = Callable[[Array, Array, Array, Noise], Colors]

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.synthetic.primitives import Array, dot
-from mmpi_ns.synthetic.scene import Scene
+from mmpi_scene.primitives import Array, dot
+from mmpi_scene.scene import Scene
 
 MIN_TRACK = 3
 """Cameras that must see a point."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mmpi_ns.synthetic import indoor, street
-from mmpi_ns.synthetic.scene import Scene
+from mmpi_scene import indoor, street
+from mmpi_scene.scene import Scene
 
 
 @dataclass(frozen=True)

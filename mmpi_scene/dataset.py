@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.synthetic.cameras import Array, Cameras
-from mmpi_ns.synthetic.movers import moving_mask
-from mmpi_ns.synthetic.scene import Colors, Scene, render
-from mmpi_ns.synthetic.sfm_like import SfmPoints, sfm_points
+from mmpi_scene.cameras import Array, Cameras
+from mmpi_scene.movers import moving_mask
+from mmpi_scene.scene import Colors, Scene, render
+from mmpi_scene.sfm_like import SfmPoints, sfm_points
 
 ExposureName = Literal["none", "auto", "vignetting"]
 GAMMA, CONTRAST = 2.2, 0.3

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mmpi_ns.synthetic.materials import Noise, band, mix, pulse, rgb
-from mmpi_ns.synthetic.primitives import Array
-from mmpi_ns.synthetic.road import Road
-from mmpi_ns.synthetic.scene import Colors
+from mmpi_scene.materials import Noise, band, mix, pulse, rgb
+from mmpi_scene.primitives import Array
+from mmpi_scene.road import Road
+from mmpi_scene.scene import Colors
 
 GRASS = rgb(0.33, 0.42, 0.17), rgb(0.47, 0.5, 0.25)
 

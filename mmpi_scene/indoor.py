@@ -7,10 +7,10 @@ from itertools import product
 
 import numpy as np
 
-from mmpi_ns.synthetic.cameras import Cameras
-from mmpi_ns.synthetic.primitives import BEIGE, BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
-from mmpi_ns.synthetic.scene import Light, Scene
-from mmpi_ns.synthetic.surroundings import floor_inside, meadow, open_sky
+from mmpi_scene.cameras import Cameras
+from mmpi_scene.primitives import BEIGE, BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
+from mmpi_scene.scene import Light, Scene
+from mmpi_scene.surroundings import floor_inside, meadow, open_sky
 
 ROOM = (6.4, 5.2, 2.7)
 """Width (x), depth (y) and height of the room, metres."""
