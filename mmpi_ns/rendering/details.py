@@ -34,7 +34,7 @@ from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, brief, say
 from mmpi_ns.utils.files import write_atomically
 
-STRENGTH = 0.75
+STRENGTH = 0.9
 """Share of a difference that is shown: the rest does not recur in other views."""
 MAX_ANGLE = 45.0
 """Between the viewing directions of an image and of the training images that it takes details from, degrees."""

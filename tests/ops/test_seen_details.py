@@ -11,7 +11,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.details import SAME_DEPTH, SAME_PIXELS, TURN, project, seen_details
+from mmpi_ns.ops.details import FADE, SAME_DEPTH, SAME_PIXELS, TURN, project, seen_details
 
 LENS = [0.08, -0.02, 0.004, 0.0, 0.003, -0.002]
 HEIGHT, WIDTH = 20, 28
@@ -89,7 +89,7 @@ def oracle(cameras, image, origin, direction, inverse):
     margin = SAME_DEPTH * max(there, here) + SAME_PIXELS / max(float(cameras.fx) * baseline, 1e-9)
     turn = np.linalg.norm(relative / length - direction)
     weight = math.exp(-min(((there - here) / margin) ** 2, 80)) / (turn + TURN)
-    return weight, weight * np.array(difference)
+    return weight, weight * np.array(difference) / (1 + (turn / FADE) ** 2)
 
 
 @pytest.mark.parametrize("lens", [None, LENS])

@@ -50,8 +50,10 @@ def test_details_are_the_weighted_mean_of_the_views():
         inverse = 1 / math.hypot(x, 5)
         views.append(DetailView(torch.tensor([value] * 3 + [inverse]).expand(HEIGHT, WIDTH, 4).contiguous(), numbers))
     ray = torch.zeros(1, 3), torch.tensor([[0.0, 0, -1]]), torch.tensor([[5.0]])
-    weights = [share / (2 * math.sin(math.atan(x / 5) / 2) + 0.01) for x, share in ((0.5, 0.9), (1.0, 0.4))]
-    expected = STRENGTH * (0.2 * weights[0] - 0.1 * weights[1]) / (sum(weights) + LEAST)
+    angles = [2 * math.sin(math.atan(x / 5) / 2) for x in (0.5, 1.0)]
+    weights = [share / (angle + 0.01) for angle, share in zip(angles, (0.9, 0.4), strict=True)]
+    faded = [value / (1 + (angle / 0.2) ** 2) for angle, value in zip(angles, (0.2, -0.1), strict=True)]
+    expected = STRENGTH * (faded[0] * weights[0] + faded[1] * weights[1]) / (sum(weights) + LEAST)
     assert torch.allclose(blended_details(views, [0.9, 0.4], *ray), torch.full((1, 3), expected), rtol=1e-3)
 
 

@@ -15,6 +15,9 @@ from mmpi_ns.ops.layout import dense
 
 TURN = 0.01
 """Angle between the viewing directions of a surface below which weights hardly grow, radians."""
+FADE = 0.2
+"""Angle at which half of a difference is left, radians: from the side surfaces look different, and errors of their depths
+displace details."""
 SAME_DEPTH = 0.05
 """Relative difference of inverse depths within which two images show the same surface."""
 SAME_PIXELS = 0.5
@@ -64,8 +67,8 @@ def seen_details(
     image: Float[Tensor, "H W 4"],
     camera: Float[Tensor, "24"],
 ) -> SeenDetails:
-    """The values of an image, interpolated, where it shows the surfaces of rays. They weigh the more the less the
-    viewing direction differs, and the better the depths agree.
+    """The values of an image, interpolated, where it shows the surfaces of rays. The less the viewing direction
+    differs, the more they weigh and the less they fade; and the better the depths agree, the more they weigh.
 
     Args:
         origins: of the rays.
@@ -90,7 +93,8 @@ def seen_details(
     margin = SAME_DEPTH * torch.maximum(there, here) + SAME_PIXELS / shift.clamp(min=TINY)
     turn = (relative / length - directions).norm(dim=-1, keepdim=True)
     agrees = torch.exp(-((there - here) / margin).square().clamp(max=80)) / (turn + TURN)
-    return SeenDetails(values[:, :3], torch.where(inside[:, None] & (there >= 0), agrees, 0.0))
+    faded = values[:, :3] / (1 + (turn / FADE).square())
+    return SeenDetails(faded, torch.where(inside[:, None] & (there >= 0), agrees, 0.0))
 
 
 @seen_details.on_cpu
