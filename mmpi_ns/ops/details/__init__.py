@@ -16,8 +16,8 @@ from mmpi_ns.ops.layout import dense
 TURN = 0.01
 """Angle between the viewing directions of a surface below which weights hardly grow, radians."""
 FADE = 0.2
-"""Angle at which half of a difference is left, radians: from the side, surfaces look different, and wrong depths displace
-details."""
+"""Angle at which half of a difference is left, radians. From the side, surfaces look different, and errors of depths
+displace details."""
 SAME_DEPTH = 0.05
 """Relative difference of inverse depths within which two images show the same surface."""
 SAME_PIXELS = 0.5
