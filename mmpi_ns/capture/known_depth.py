@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from threading import Lock
 from typing import cast
 
 import cv2
@@ -182,7 +183,14 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
 def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
     """The codes of all images in turn, from the cache if the key is there."""
     arrays = remembered(key, lambda: ((f"{i}", codes) for i, codes in enumerate(find())))
-    return KnownDepth(Computed(len(arrays), lambda i: cast(Codes, arrays[f"{i}"])))
+    # One at a time: numpy parses the header of an array with ast, which fails at times in threads of CPython 3.11.
+    reading = Lock()
+
+    def read(i: int) -> Codes:
+        with reading:
+            return cast(Codes, arrays[f"{i}"])
+
+    return KnownDepth(Computed(len(arrays), read))
 
 
 def with_sensor(known: KnownDepth, files: list[Path], unit: float, posed: PosedImages) -> KnownDepth:

@@ -25,7 +25,7 @@ DEFAULTS = {
     "mmpi": Default(20000, 4096, PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6)),
     "mmpi-small": Default(4000, 1024, PlacementConfig(texel_pixels=1.0)),
 }
-PIXELS = 5.5e6
+PIXELS = 6.5e6
 """Training pixels of a window up to which it is a small capture."""
 MOST_TIMES = 3.0
 """Largest multiple of a small capture's steps."""

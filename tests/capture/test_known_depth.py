@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mmpi_ns.capture import known_depth
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.known_depth import (
     POINT_ERROR,
@@ -204,3 +207,24 @@ def test_a_depth_image_that_cannot_be_read_is_named(tmp_path, content):
 def test_the_observations_need_no_points():
     observations = seen(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)))
     assert with_points(KnownDepth.nothing(observations.sizes), observations).share == 0
+
+
+def test_threads_read_cached_depths_one_at_a_time(monkeypatch):
+    """numpy parses the headers of their files with ast, which fails at times in threads of CPython 3.11."""
+    reading, most = [], []
+
+    class Arrays(dict):
+        def __getitem__(self, name):
+            reading.append(name)
+            most.append(len(reading))
+            time.sleep(0.002)
+            reading.remove(name)
+            return super().__getitem__(name)
+
+    codes = packed(np.full((HEIGHT, WIDTH, 2), 0.25))
+    monkeypatch.setattr(known_depth, "remembered", lambda *_: Arrays({f"{i}": codes for i in range(20)}))
+    known = known_depth._from_cache("", list)
+    with ThreadPoolExecutor(8) as pool:
+        images = list(pool.map(known.image, range(20)))
+    assert len(images) == 20 and (images[0] == 0.25).all()
+    assert max(most) == 1

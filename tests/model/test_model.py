@@ -349,7 +349,7 @@ def test_lpips_is_left_out_with_a_message_where_its_weights_are_not_available(
     outputs = model.get_outputs_for_camera(camera)
     for _ in range(2):
         values, images = model.get_image_metrics_and_images(outputs, batch)
-        assert set(values) == {"psnr", "ssim", "cc_psnr", "dropped_mass"}
+        assert set(values) == {"psnr", "ssim", "cc_psnr", "field_psnr", "field_ssim", "dropped_mass"}
         assert all(isinstance(v, float) and np.isfinite(v) for v in values.values())
     assert len(calls) == 1, "one attempt is enough"
     assert "LPIPS is left out" in " ".join(capsys.readouterr().out.split())
