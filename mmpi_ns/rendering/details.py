@@ -117,7 +117,7 @@ class Details:
     def added(
         self, outputs: dict[str, Tensor], bundle: RayBundle, nearest: int, exposure: Float[Tensor, "3"] | None
     ) -> dict[str, Tensor]:
-        """The outputs of an image [H, W, C] with details: in rgb and radiance; and ``detail`` and ``field_rgb`` apart.
+        """The outputs of an image [H, W, C] with details in rgb and radiance; the field's own begin with ``field_``.
 
         Args:
             outputs: of the field.
@@ -127,8 +127,10 @@ class Details:
         """
         detail = self.of_image(bundle, outputs["depth"], nearest) * outputs["accumulation"]
         rgb = (outputs["rgb"] + (detail if exposure is None else exposure * detail)).clamp(0, 1)
-        radiance = {"radiance": outputs["radiance"] + detail} if "radiance" in outputs else {}
-        return outputs | radiance | {"rgb": rgb, "field_rgb": outputs["rgb"], "detail": detail}
+        shown = outputs | {"rgb": rgb, "field_rgb": outputs["rgb"]}
+        if "radiance" in outputs:
+            shown |= {"radiance": outputs["radiance"] + detail, "field_radiance": outputs["radiance"]}
+        return shown
 
     def of_image(self, bundle: RayBundle, depth: Float[Tensor, "H W 1"], nearest: int) -> Float[Tensor, "H W 3"]:
         """What to add to the radiance of an image.

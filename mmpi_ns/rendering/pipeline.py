@@ -87,11 +87,10 @@ class MMPIPipeline(VanillaPipeline):
         if exposure is None:
             say("No training image shows what an evaluated one does, or they are gone: it is scored at mean exposure.")
             return outputs
-        exposure, radiance = exposure.to(outputs["radiance"]), outputs["radiance"]
-        exposed = {"rgb": (exposure * radiance).clamp(0, 1)}
-        if "detail" in outputs:
-            exposed["field_rgb"] = (exposure * (radiance - outputs["detail"])).clamp(0, 1)
-        return outputs | exposed
+        exposed = {
+            name.replace("radiance", "rgb"): outputs[name] for name in ("radiance", "field_radiance") if name in outputs
+        }
+        return outputs | {name: (exposure.to(radiance) * radiance).clamp(0, 1) for name, radiance in exposed.items()}
 
 
 def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:

@@ -103,26 +103,30 @@ def test_an_image_at_a_training_camera_gets_its_details(tmp_path):
                "rgb": torch.full((HEIGHT, WIDTH, 3), 0.5)}  # fmt: skip
     shown = Details(tmp_path).added(outputs, bundle, 4, None)
     expected = STRENGTH * planes[0][:3].movedim(0, -1)
-    assert torch.allclose(shown["detail"], expected, atol=4e-3)
-    assert torch.allclose(shown["rgb"], (0.5 + shown["detail"]).clamp(0, 1))
+    assert torch.allclose(shown["rgb"], (0.5 + expected).clamp(0, 1), atol=4e-3)
     assert bool((shown["field_rgb"] == 0.5).all())
     double = Details(tmp_path).added(outputs, bundle, 4, torch.full((3,), 2.0))
-    assert torch.allclose(double["rgb"], (0.5 + 2 * shown["detail"]).clamp(0, 1))
+    assert torch.allclose(double["rgb"], (0.5 + 2 * expected).clamp(0, 1), atol=8e-3)
+    light = Details(tmp_path).added(outputs | {"radiance": outputs["rgb"]}, bundle, 4, None)
+    assert torch.allclose(light["radiance"], 0.5 + expected, atol=4e-3) and bool((light["field_radiance"] == 0.5).all())
 
 
 def test_other_surfaces_masks_and_empty_pixels_show_nothing(tmp_path):
+    def added(outputs, rays):
+        return Details(tmp_path).added(outputs, rays, 4, None)["rgb"]
+
     planes = [torch.cat([torch.full((3, HEIGHT, WIDTH), 0.2), torch.full((1, HEIGHT, WIDTH), 0.25)])]
     bundle, open_ = image_rays(camera(0.4)), torch.ones(HEIGHT, WIDTH, 1)
     outputs = {"depth": torch.full((HEIGHT, WIDTH, 1), 4.0), "accumulation": open_, "rgb": open_.expand(-1, -1, 3) / 2}
     write(tmp_path, joined(camera()), planes)
-    assert Details(tmp_path).added(outputs, bundle, 4, None)["detail"][:, :-8].min() > 0.1
+    assert (added(outputs, bundle) - 0.5)[:, :-8].min() > 0.1
     behind = outputs | {"depth": torch.full((HEIGHT, WIDTH, 1), 1.0)}
-    assert Details(tmp_path).added(behind, bundle, 4, None)["detail"].abs().max() < 1e-3
+    assert (added(behind, bundle) - 0.5).abs().max() < 1e-3
     empty = outputs | {"accumulation": torch.zeros_like(open_)}
-    assert not Details(tmp_path).added(empty, bundle, 4, None)["detail"].any()
+    assert bool((added(empty, bundle) == 0.5).all())
     write(tmp_path, joined(camera()), planes, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
     for place in (bundle, image_rays(camera())):
-        assert not Details(tmp_path).added(outputs, place, 4, None)["detail"].any()
+        assert bool((added(outputs, place) == 0.5).all())
 
 
 def test_details_change_smoothly_as_a_camera_moves(tmp_path):
