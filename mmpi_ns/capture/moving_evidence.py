@@ -191,7 +191,8 @@ class Warp:
             np.asarray(cv2.scaleAdd(inverse, shift, far), np.float32)
             for shift, far in zip(self.shifts, self.far, strict=True)
         )
-        return right / ahead, down / ahead, ahead
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return right / ahead, down / ahead, ahead
 
 
 @dataclass(frozen=True)
