@@ -29,7 +29,10 @@ STRENGTHS = (0.5, 1.0)
 
 @dataclass
 class DetailsOf(Bench):
-    """Scores test images of finished runs without details and with them; makes them where a run has none."""
+    """Scores test images of finished runs without details and with them; makes them where a run has none.
+
+    Made here, they lack the masks of what moves, which only a training looks for.
+    """
 
     load_configs: tuple[Path, ...]
     """config.yml of each run."""
