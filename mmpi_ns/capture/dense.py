@@ -24,11 +24,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-from torch import Tensor
 
+from mmpi_ns.capture.patches import search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Map, View, camera_matrix, load_view, look_up, pixel_grid, strips
-from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
+from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
+from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_turn, num_threads, one_thread_each
@@ -98,38 +98,6 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
     coarse = np.where(np.isfinite(between), between, nearest).astype(np.float32)
     grid_x, grid_y = pixel_grid((height, width))
     return look_up(coarse, grid_x / step + 0.5, grid_y / step + 0.5)
-
-
-@dataclass(frozen=True)
-class Parallax:
-    """Places of a view's pixels in a neighbouring view: homogeneous pixels a + q b for inverse depth q."""
-
-    linear: NDArray[np.float64]
-    """a at a pixel (x, y) is this times (x, y, 1). [3, 3]"""
-    b: NDArray[np.float32]
-
-    @staticmethod
-    def between(view: View, neighbour: View) -> Parallax:
-        axes = np.diag([1.0, -1.0, -1.0])  # OpenCV's: right, down, ahead
-        turn = axes @ neighbour.pose[:, :3].T @ view.pose[:, :3] @ axes
-        shift = axes @ neighbour.pose[:, :3].T @ (view.pose[:, 3] - neighbour.pose[:, 3])
-        to_pixels = camera_matrix(neighbour.pinhole)
-        linear = to_pixels @ turn @ np.linalg.inv(camera_matrix(view.pinhole))
-        return Parallax(linear, (to_pixels @ shift).astype(np.float32))
-
-    @property
-    def tensors(self) -> tuple[Tensor, Tensor]:
-        """As compiled operations read them."""
-        return torch.from_numpy(self.linear).float(), torch.from_numpy(self.b)
-
-    def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
-        """Pixels x and y of points at these inverse depths, far outside if behind, and their depths over those here."""
-        maps = np.empty((3, *inverse.shape), np.float32)
-        for rows in strips(inverse.shape):
-            places = place_pixels(torch.from_numpy(inverse[rows]), *self.tensors, rows.start)
-            for part, values in zip(maps, places, strict=True):
-                part[rows] = values.numpy()
-        return maps[0], maps[1], maps[2]
 
 
 def measure(
@@ -263,33 +231,47 @@ def _tasks(
 
 
 def matched(view: View, others: list[View], points: NDArray[np.float64], rounds: Sequence[int] | None = None) -> Depth:
-    """The depths of a view by comparison with other views, in rounds from coarse to fine."""
+    """The depths of a view by comparison with other views: planes at a low resolution, then optical flow, and planes
+    again where that gives nothing. ``rounds`` of optical flow alone, if there are any."""
+    if not others or max(view.gray.shape) < SMALLEST:
+        return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow.setFinestScale(0)
     flow.setVariationalRefinementIterations(0)
     flow.setGradientDescentIterations(ITERATIONS)
-    rough, depth = None, Depth(*np.zeros((2, *view.gray.shape), np.float32))
     flow.setPatchStride(STRIDE[is_large])
-    for factor in (rounds or ROUNDS[is_large]) if others else ():
-        if (factor > 1 and min(view.gray.shape) < LEAST_FLOW * factor) or max(view.gray.shape) < SMALLEST:
+    rough, depth = rough_inverse_depth(view, points), None
+    surfaces = None if rounds else search_surfaces(view, others, rough)
+    if surfaces is not None:
+        depth = Depth(surfaces.inverse, surfaces.error)
+    for factor in rounds or ((1,) if surfaces else ROUNDS[is_large]):
+        if factor > 1 and min(view.gray.shape) < LEAST_FLOW * factor:
             continue
+        if depth is not None:
+            rough = pulled(rough, depth)
         small = view.reduced(factor)
-        if rough is None:
-            rough = rough_inverse_depth(small, points)
-        else:
-            # Rough depths are pulled towards measured ones nearby, from coarse to fine.
-            relative = depth.error / np.maximum(depth.inverse, 1e-12)
-            weight = np.where(depth.inverse > 0, 1 / np.maximum(relative, 0.01), 0).astype(np.float32)
-            for side in (65, 33, 17, 9):
-                near = _mean(weight, side)
-                share = near / (near + PRIOR_ERROR)
-                rough = share * _mean(weight * depth.inverse, side) / np.maximum(near, 1e-9) + (1 - share) * rough
-            rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+        rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         of_view = mean_and_contrast(small.gray)
         pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]
         depth = without_fringes(small, fuse(*zip(*pairs, strict=True)))
-    return depth
+    assert depth is not None
+    if surfaces is None:
+        return depth
+    is_measured, (inverse, error) = depth.inverse > 0, surfaces.without_edges().enlarged(view.gray.shape)
+    return Depth(np.where(is_measured, depth.inverse, inverse), np.where(is_measured, depth.error, error))
+
+
+def pulled(rough: Map, depth: Depth) -> Map:
+    """Rough inverse depths, pulled towards measured ones nearby, from coarse to fine; of their size."""
+    rough = np.asarray(cv2.resize(rough, depth.inverse.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
+    relative = depth.error / np.maximum(depth.inverse, 1e-12)
+    weight = np.where(depth.inverse > 0, 1 / np.maximum(relative, 0.01), 0).astype(np.float32)
+    for side in (65, 33, 17, 9):
+        near = _mean(weight, side)
+        share = near / (near + PRIOR_ERROR)
+        rough = share * _mean(weight * depth.inverse, side) / np.maximum(near, 1e-9) + (1 - share) * rough
+    return rough
 
 
 def without_fringes(view: View, depth: Depth) -> Depth:

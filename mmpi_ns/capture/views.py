@@ -10,9 +10,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.ops.matches import place_pixels
 from mmpi_ns.utils.errors import InputError
 
 Map = NDArray[np.float32]
@@ -130,6 +133,38 @@ def strips(shape: tuple[int, ...]) -> Iterator[slice]:
 def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
     fx, fy, cx, cy = pinhole
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """Places of a view's pixels in a neighbouring view: homogeneous pixels a + q b for inverse depth q."""
+
+    linear: NDArray[np.float64]
+    """a at a pixel (x, y) is this times (x, y, 1). [3, 3]"""
+    b: NDArray[np.float32]
+
+    @staticmethod
+    def between(view: View, neighbour: View) -> Parallax:
+        axes = np.diag([1.0, -1.0, -1.0])  # OpenCV's: right, down, ahead
+        turn = axes @ neighbour.pose[:, :3].T @ view.pose[:, :3] @ axes
+        shift = axes @ neighbour.pose[:, :3].T @ (view.pose[:, 3] - neighbour.pose[:, 3])
+        to_pixels = camera_matrix(neighbour.pinhole)
+        linear = to_pixels @ turn @ np.linalg.inv(camera_matrix(view.pinhole))
+        return Parallax(linear, (to_pixels @ shift).astype(np.float32))
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor]:
+        """As compiled operations read them."""
+        return torch.from_numpy(self.linear).float(), torch.from_numpy(self.b)
+
+    def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
+        """Pixels x and y of points at these inverse depths, far outside if behind, and their depths over those here."""
+        maps = np.empty((3, *inverse.shape), np.float32)
+        for rows in strips(inverse.shape):
+            places = place_pixels(torch.from_numpy(inverse[rows]), *self.tensors, rows.start)
+            for part, values in zip(maps, places, strict=True):
+                part[rows] = values.numpy()
+        return maps[0], maps[1], maps[2]
 
 
 def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:

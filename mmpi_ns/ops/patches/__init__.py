@@ -1,0 +1,236 @@
+"""Planes through the pixels of an image that make other images look like it (PatchMatch stereo: Bleyer, Rhemann and
+Rother 2011; many pixels at once as in Galliani, Lasinger and Schindler 2015).
+
+In a pinhole image the inverse depth of a plane is linear in the pixel, so a pixel's plane is (q, right, down): its
+inverse depth there and the change for each pixel. A patch on it appears in another image at the homogeneous pixels
+a + q b (``ops/matches``), which are linear in the pixel, too. Planes are judged by the correlation of patches.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int64, UInt8
+from torch import Tensor
+from torch.nn.functional import pad
+
+from mmpi_ns.ops.build import even_bounds, run_in_parts
+from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.layout import dense
+
+REACH = 2
+"""Pixels of a patch on each side of its middle."""
+LEVELS = 3
+"""Sizes of an image that is compared: twice, once and half as large as it should be."""
+LEAST_AHEAD, LEAST_SHARE = 1e-6, 0.2
+"""Depth there over depth here, at least, and of a patch's pixels over that of its middle."""
+LEAST_CONTRAST = 1.0
+"""Standard deviation of gray levels of a patch, at least."""
+UNSEEN = 0.4
+"""Correlation with an image that does not show the patch."""
+LEAST_SIDE = 4
+"""Pixels of an image's shorter side, at least, so that half of it has two."""
+OFFSETS = (1, 4, 2)
+"""Pixels from which planes spread, in turn."""
+GRAZING = 0.05
+"""Cosine between a plane's normal and the view direction, at least, times the length of the pixel's direction."""
+
+
+class Others(NamedTuple):
+    """K images that an image is compared with."""
+
+    grays: UInt8[Tensor, "T"]
+    """Pixels of all their sizes, row by row, one after the other, and three numbers more."""
+    levels: Int64[Tensor, "K 3 3"]
+    """First pixel, height and width of each at twice its size, once and half of it."""
+    linear: Float[Tensor, "K 3 3"]
+    """a at a pixel (x, y) of the image is this times (x, y, 1)."""
+    b: Float[Tensor, "K 3"]
+
+
+class Patches(NamedTuple):
+    """Planes through pixels."""
+
+    planes: Float[Tensor, "H W 3"]
+    """Inverse depth at the pixel's centre, and its change for a pixel to the right and for one down."""
+    alike: Float[Tensor, "H W"]
+    """Mean of the two largest correlations, ``UNSEEN`` for images that do not show it; -1 where there is none."""
+
+
+@operation()
+def compare_planes(
+    gray: UInt8[Tensor, "H W"],
+    patches: Patches,
+    planes: Float[Tensor, "H W 3"],
+    others: Others,
+    stride: int,
+) -> Patches:
+    """The better ones of two planes at each pixel.
+
+    Args:
+        gray: the image.
+        patches: planes, with their correlations.
+        planes: what they are compared with.
+        others: the images that decide.
+        stride: pixels between the pixels of a patch, of which there are 5 x 5.
+    """
+    return _better(_References(gray, stride), patches, planes, others)
+
+
+@operation()
+def spread_planes(
+    gray: UInt8[Tensor, "H W"],
+    patches: Patches,
+    changes: Float[Tensor, "H W 4"],
+    pinhole: Float[Tensor, "4"],
+    others: Others,
+    stride: int,
+    offset: int,
+) -> Patches:
+    """The best of each pixel's plane, those of the pixels around it, and two that differ from the best a little.
+
+    Args:
+        gray: the image.
+        patches: planes, with their correlations.
+        changes: factor of the inverse depth of the first that differs, as a power of 2 (the inverse of the second's), and
+            what is added to the unit normal of the second.
+        pinhole: fx, fy, cx, cy of the image.
+        others: the images that decide.
+        stride: pixels between the pixels of a patch, of which there are 5 x 5.
+        offset: pixels to the left, right, above and below from which planes come.
+    """
+    references, before = _References(gray, stride), patches.planes
+    height, width = gray.shape
+    for right, down in ((-offset, 0), (offset, 0), (0, -offset), (0, offset)):
+        rows, columns = (torch.arange(n) + shift for n, shift in ((height, down), (width, right)))
+        inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+        taken = before[rows.clamp(0, height - 1)][:, columns.clamp(0, width - 1)]
+        q = taken[..., 0] - taken[..., 1] * right - taken[..., 2] * down
+        planes = torch.where(inside[..., None], torch.stack([q, taken[..., 1], taken[..., 2]], -1), -1.0)
+        patches = _better(references, patches, planes, others)
+    factor = torch.exp2(changes[..., :1])
+    patches = _better(references, patches, patches.planes * factor, others)
+    return _better(references, patches, _turned(patches.planes / factor, changes[..., 1:], pinhole), others)
+
+
+def _turned(planes: Tensor, turns: Tensor, pinhole: Tensor) -> Tensor:
+    """Planes of the same inverse depths, with something added to their unit normals. [H, W, 3] each"""
+    fx, fy, cx, cy = pinhole
+    x, y = _centers(planes)
+    q, right, down = planes.unbind(-1)
+    normal = torch.stack([fx * right, fy * down, q - right * (x - cx) - down * (y - cy)], -1)
+    normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-20) + turns
+    towards = normal[..., 0] * (x - cx) / fx + normal[..., 1] * (y - cy) / fy + normal[..., 2]
+    scale = q / torch.where(towards < 0, towards.clamp(max=-GRAZING), towards.clamp(min=GRAZING))
+    return torch.stack([q, scale * normal[..., 0] / fx, scale * normal[..., 1] / fy], -1)
+
+
+def _centers(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Coordinates right [W] and down [H, 1] of pixels' centres."""
+    height, width = image.shape[:2]
+    kind = image.dtype if image.is_floating_point() else torch.float32
+    return torch.arange(width, dtype=kind) + 0.5, torch.arange(height, dtype=kind)[:, None] + 0.5
+
+
+class _References:
+    """The patches of an image, less their means."""
+
+    def __init__(self, gray: Tensor, stride: int) -> None:
+        height, width = gray.shape
+        steps = torch.arange(-REACH, REACH + 1) * stride
+        rows, columns = ((torch.arange(n)[:, None] + steps).clamp(0, n - 1) for n in (height, width))
+        values = gray[rows[:, None, :, None], columns[None, :, None, :]].float().flatten(2)
+        self.gray, self.steps = gray, steps
+        self.values = values - values.mean(-1, keepdim=True)
+        """[H, W, 25]"""
+        self.squares = self.values.square().sum(-1)
+
+
+def _better(references: _References, patches: Patches, planes: Tensor, others: Others) -> Patches:
+    best, second = (torch.full(planes.shape[:2], -1.0, dtype=planes.dtype) for _ in range(2))
+    is_shown = torch.zeros(planes.shape[:2], dtype=torch.bool)
+    for sizes, linear, b in zip(others.levels, others.linear, others.b, strict=True):
+        alike, shown = _correlations(references, planes, others.grays, sizes, linear, b)
+        second = torch.maximum(second, torch.minimum(best, alike))
+        best, is_shown = torch.maximum(best, alike), is_shown | shown
+    flat = references.squares < LEAST_CONTRAST**2 * references.values.shape[-1]
+    mean = torch.where(is_shown & ~flat & (planes[..., 0] > 0), (best + second) / 2, -1.0)
+    better = mean > patches.alike
+    return Patches(torch.where(better[..., None], planes, patches.planes), torch.where(better, mean, patches.alike))
+
+
+def _correlations(
+    references: _References, planes: Tensor, grays: Tensor, sizes: Tensor, linear: Tensor, b: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Correlations of patches with one image, and whether it shows their middles. [H, W] each"""
+    x, y = _centers(planes)
+    q, right, down = planes.unbind(-1)
+    middle = torch.stack([m[0] * x + (m[1] * y + m[2]) + q * s for m, s in zip(linear, b, strict=True)])
+    to_right, to_down = (
+        torch.stack([linear[i, n] + slope * b[i] for i in range(3)]) for n, slope in enumerate((right, down))
+    )
+    ahead = middle[2] > LEAST_AHEAD
+    at = middle[:2] / torch.where(ahead, middle[2], 1.0)
+    height, width = sizes[1, 1:].tolist()
+    shown = ahead & (at[0] >= 0.5) & (at[0] <= width - 0.5) & (at[1] >= 0.5) & (at[1] <= height - 0.5)
+    # Pixels there for a pixel here decide the size at which the image is looked at.
+    (xr, yr), (xd, yd) = ((to[:2] - at * to[2]) / torch.where(ahead, middle[2], 1.0) for to in (to_right, to_down))
+    area = (xr * yd - xd * yr).abs()
+    level = torch.where(area < 0.5, 0, torch.where(area > 2.0, 2, 1))
+    first, heights, widths = (sizes[level, n] for n in range(3))
+    steps_down, steps_right = torch.meshgrid(references.steps, references.steps, indexing="ij")
+    places = middle[..., None] + to_right[..., None] * steps_right.flatten() + to_down[..., None] * steps_down.flatten()
+    whole = (places[2] >= LEAST_SHARE * middle[2][..., None]).all(-1)
+    depth = torch.where(whole[..., None], places[2], 1.0)
+    column, row = (
+        (place / depth * (of / size)[..., None] - 0.5).clamp(min=0)
+        for place, of, size in zip(places, (widths, heights), (width, height), strict=False)
+    )
+    column = torch.minimum(column, (widths - 1)[..., None].to(column.dtype))
+    row = torch.minimum(row, (heights - 1)[..., None].to(row.dtype))
+    left = torch.minimum(column.long(), (widths - 2)[..., None])
+    top = torch.minimum(row.long(), (heights - 2)[..., None])
+    u, v, corner = column - left, row - top, first[..., None] + top * widths[..., None] + left
+    below = corner + widths[..., None]
+    upper, lower = (torch.lerp(grays[c].to(u), grays[c + 1].to(u), u) for c in (corner, below))
+    values = torch.lerp(upper, lower, v)
+    values = values - values.mean(-1, keepdim=True)
+    squares = values.square().sum(-1)
+    alike = (values * references.values).sum(-1) / (squares * references.squares).clamp(min=1e-20).sqrt()
+    alike = torch.where(whole & (squares >= LEAST_CONTRAST**2 * values.shape[-1]), alike, -1.0)
+    return torch.where(shown, alike, UNSEEN), shown
+
+
+def others_of(
+    grays: list[list[UInt8[Tensor, "h w"]]], linear: Float[Tensor, "K 3 3"], b: Float[Tensor, "K 3"]
+) -> Others:
+    """Images to compare with, each at twice its size, once and half of it; at least two pixels wide and high."""
+    flat = [gray for sizes in grays for gray in sizes]
+    assert all(min(gray.shape) > 1 for gray in flat), [gray.shape for gray in flat]
+    ends = torch.tensor([gray.numel() for gray in flat]).cumsum(0)
+    shapes = torch.tensor([gray.shape for gray in flat])
+    sizes = torch.cat([(ends - shapes.prod(1))[:, None], shapes], 1).view(-1, LEVELS, 3)
+    # The compiled form reads four pixels at a time.
+    return Others(pad(torch.cat([gray.reshape(-1) for gray in flat]), (0, 3)), sizes, linear, b)
+
+
+def _run(name: str, gray: Tensor, patches: Patches, others: Others, stride: int, *values: Any) -> Patches:
+    better = Patches(torch.empty_like(patches.planes), torch.empty_like(patches.alike))
+    arrays = *dense(gray, others.grays, dtype=torch.uint8), *dense(others.levels, dtype=torch.int64)
+    count = len(others.levels)
+    compared = *gray.shape, *arrays, *dense(others.linear, others.b), count, stride
+    run_in_parts(f"mmpi_{name}", even_bounds(len(gray), 1), *compared, *dense(*patches), *values, *better)
+    return better
+
+
+@compare_planes.on_cpu
+def compare_planes_on_cpu(gray: Tensor, patches: Patches, planes: Tensor, others: Others, stride: int) -> Patches:
+    return _run("compare_planes", gray, patches, others, stride, *dense(planes))
+
+
+@spread_planes.on_cpu
+def spread_planes_on_cpu(
+    gray: Tensor, patches: Patches, changes: Tensor, pinhole: Tensor, others: Others, stride: int, offset: int
+) -> Patches:
+    return _run("spread_planes", gray, patches, others, stride, *dense(changes, pinhole), offset)
