@@ -47,6 +47,7 @@ SMALLEST = 12
 """Pixels of the longer side that OpenCV's optical flow needs."""
 ROUNDS = {False: (1, 1, 1), True: (2, 1)}
 """Rounds of matching, of small and of large images, each at the working size divided by this."""
+SEARCHED = {False: (1, 1), True: (1,)}
 SECONDS = 0.8
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, ITERATIONS = {False: 5, True: 6}, 8
@@ -245,7 +246,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     surfaces = None if rounds else search_surfaces(view, others, rough)
     if surfaces is not None:
         depth = Depth(surfaces.inverse, surfaces.error)
-    for factor in rounds or ((1,) if surfaces else ROUNDS[is_large]):
+    for factor in rounds or (SEARCHED if surfaces else ROUNDS)[is_large]:
         if factor > 1 and min(view.gray.shape) < LEAST_FLOW * factor:
             continue
         if depth is not None:

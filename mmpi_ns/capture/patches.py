@@ -1,9 +1,9 @@
 """Depths of a view at a low resolution: patches of planes that make its neighbours look like it.
 
-Dense matching (``dense.py``) starts from rough depths. Between the SfM points of a capture of few images these are wrong
-by more than optical flow mends: a wall beside the path is twice as large in one image as in the one before. A plane
-through a patch predicts how a neighbour shows it, magnified and slanted. Random planes are compared at a small size, the
-good ones spread from pixel to pixel, and larger sizes refine them (``ops/patches``).
+Dense matching (``dense.py``) starts from rough depths. Between the SfM points of a capture of few images these are
+wrong by more than optical flow mends: a wall beside the path is twice as large in one image as in the one before. A
+plane through a patch predicts how a neighbour shows it, magnified and slanted. Random planes are compared at a small
+size, the good ones spread from pixel to pixel, and larger sizes refine them (``ops/patches``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from torch import Tensor
 from mmpi_ns.capture.views import Map, Parallax, View
 from mmpi_ns.ops.patches import (
     GRAZING,
-    LEAST_SIDE,
     OFFSETS,
     Patches,
     compare_planes,
@@ -30,9 +29,11 @@ from mmpi_ns.ops.patches import (
 
 PIXELS = 220.0**2
 """Pixels of a view in the search, at most."""
+LEAST_SIDE = 2
+"""Pixels of its shorter side at the smallest size, at least."""
 LEVELS = ((4, 6, 1.0), (2, 4, 0.5), (1, 3, 0.3))
-"""Each level's divisor of the size, its rounds, and how much planes change in the first, which halves in each: octaves of
-the inverse depth, and parts of the unit normal."""
+"""Each level's divisor of the size, its rounds, and how much planes change in the first, which halves in each: octaves
+of the inverse depth, and parts of the unit normal."""
 RANDOM, BEYOND = 8, 4.0
 """Random planes for each pixel of the smallest size, and how far they reach beyond the nearest and farthest points."""
 STRIDE = 2
@@ -97,7 +98,7 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
     for divisor, rounds, change in LEVELS:
         factor = divisor * smallest
         small = view.reduced(factor)
-        shape, gray = small.gray.shape, torch.from_numpy(np.ascontiguousarray(small.gray))
+        shape, gray = small.gray.shape, _pixels(small)
         parallax = [Parallax.between(small, other.reduced(factor)).tensors for other in others]
         linear, b = (torch.stack(parts) for parts in zip(*parallax, strict=True))
         sizes = [[max(1.0, factor / 2), factor, 2 * factor]] * len(others)
@@ -139,7 +140,7 @@ def _random_planes(rough: Map, shape: tuple[int, ...], pinhole: Tensor, random: 
 
 
 def _resized(planes: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Planes [h, w, 3] of an image at another size [H, W, 3]: those through the nearest pixels, of which rows and columns
+    """Planes [h, w, 3] of an image at another size [H, W, 3]: those through the nearest pixels, whose rows and columns
     follow."""
     (rows, down, height), (columns, right, width) = (
         (at.long().clamp(max=n - 1), at, n / to)
@@ -168,8 +169,8 @@ def _certain(view: View, others: Sequence[View], patches: Patches) -> Surfaces:
 
 
 def _parallax(view: View, others: Sequence[View], inverse: Map) -> Map:
-    """Pixels of motion in the second best of the other views for each unit of inverse depth, in the only one if there is
-    one. [h, w]"""
+    """Pixels of motion for each unit of inverse depth in the second best of the other views, or in the only one.
+    [h, w]"""
     change = np.maximum(1e-3 * inverse, 1e-12)
     best, second = np.zeros((2, *inverse.shape), np.float32)
     for other in others:

@@ -11,9 +11,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
-from torch.nn.functional import pad
 
 from mmpi_ns.ops.build import even_bounds, run_in_parts
 from mmpi_ns.ops.dispatch import operation
@@ -29,8 +28,6 @@ LEAST_CONTRAST = 1.0
 """Standard deviation of gray levels of a patch, at least."""
 UNSEEN = 0.4
 """Correlation with an image that does not show the patch."""
-LEAST_SIDE = 4
-"""Pixels of an image's shorter side, at least, so that half of it has two."""
 OFFSETS = (1, 4, 2)
 """Pixels from which planes spread, in turn."""
 GRAZING = 0.05
@@ -40,8 +37,9 @@ GRAZING = 0.05
 class Others(NamedTuple):
     """K images that an image is compared with."""
 
-    grays: UInt8[Tensor, "T"]
-    """Pixels of all their sizes, row by row, one after the other, and three numbers more."""
+    corners: Int32[Tensor, "T"]
+    """Pixels of all their sizes, row by row, one after the other: four bytes, of a pixel, the one to its right, the one
+    below and the one below that; beyond the border those of the border."""
     levels: Int64[Tensor, "K 3 3"]
     """First pixel, height and width of each at twice its size, once and half of it."""
     linear: Float[Tensor, "K 3 3"]
@@ -93,8 +91,8 @@ def spread_planes(
     Args:
         gray: the image.
         patches: planes, with their correlations.
-        changes: factor of the inverse depth of the first that differs, as a power of 2 (the inverse of the second's), and
-            what is added to the unit normal of the second.
+        changes: of the first that differs, octaves of the inverse depth, which the second changes by as much the other
+            way; and what the second adds to the unit normal.
         pinhole: fx, fy, cx, cy of the image.
         others: the images that decide.
         stride: pixels between the pixels of a patch, of which there are 5 x 5.
@@ -151,7 +149,7 @@ def _better(references: _References, patches: Patches, planes: Tensor, others: O
     best, second = (torch.full(planes.shape[:2], -1.0, dtype=planes.dtype) for _ in range(2))
     is_shown = torch.zeros(planes.shape[:2], dtype=torch.bool)
     for sizes, linear, b in zip(others.levels, others.linear, others.b, strict=True):
-        alike, shown = _correlations(references, planes, others.grays, sizes, linear, b)
+        alike, shown = _correlations(references, planes, others.corners, sizes, linear, b)
         second = torch.maximum(second, torch.minimum(best, alike))
         best, is_shown = torch.maximum(best, alike), is_shown | shown
     flat = references.squares < LEAST_CONTRAST**2 * references.values.shape[-1]
@@ -161,7 +159,7 @@ def _better(references: _References, patches: Patches, planes: Tensor, others: O
 
 
 def _correlations(
-    references: _References, planes: Tensor, grays: Tensor, sizes: Tensor, linear: Tensor, b: Tensor
+    references: _References, planes: Tensor, corners: Tensor, sizes: Tensor, linear: Tensor, b: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Correlations of patches with one image, and whether it shows their middles. [H, W] each"""
     x, y = _centers(planes)
@@ -189,12 +187,11 @@ def _correlations(
     )
     column = torch.minimum(column, (widths - 1)[..., None].to(column.dtype))
     row = torch.minimum(row, (heights - 1)[..., None].to(row.dtype))
-    left = torch.minimum(column.long(), (widths - 2)[..., None])
-    top = torch.minimum(row.long(), (heights - 2)[..., None])
-    u, v, corner = column - left, row - top, first[..., None] + top * widths[..., None] + left
-    below = corner + widths[..., None]
-    upper, lower = (torch.lerp(grays[c].to(u), grays[c + 1].to(u), u) for c in (corner, below))
-    values = torch.lerp(upper, lower, v)
+    left, top = column.long(), row.long()
+    u, v = column - left, row - top
+    at = first[..., None] + top * widths[..., None] + left
+    a, b, c, d = (part.to(u) for part in corners.view(torch.uint8).view(-1, 4)[at].unbind(-1))
+    values = torch.lerp(torch.lerp(a, b, u), torch.lerp(c, d, u), v)
     values = values - values.mean(-1, keepdim=True)
     squares = values.square().sum(-1)
     alike = (values * references.values).sum(-1) / (squares * references.squares).clamp(min=1e-20).sqrt()
@@ -205,22 +202,25 @@ def _correlations(
 def others_of(
     grays: list[list[UInt8[Tensor, "h w"]]], linear: Float[Tensor, "K 3 3"], b: Float[Tensor, "K 3"]
 ) -> Others:
-    """Images to compare with, each at twice its size, once and half of it; at least two pixels wide and high."""
-    flat = [gray for sizes in grays for gray in sizes]
-    assert all(min(gray.shape) > 1 for gray in flat), [gray.shape for gray in flat]
-    ends = torch.tensor([gray.numel() for gray in flat]).cumsum(0)
-    shapes = torch.tensor([gray.shape for gray in flat])
-    sizes = torch.cat([(ends - shapes.prod(1))[:, None], shapes], 1).view(-1, LEVELS, 3)
-    # The compiled form reads four pixels at a time.
-    return Others(pad(torch.cat([gray.reshape(-1) for gray in flat]), (0, 3)), sizes, linear, b)
+    """Images to compare with, each at twice its size, once and half of it."""
+    corners, levels, first = [], [], 0
+    for gray in (gray for sizes in grays for gray in sizes):
+        right = torch.cat([gray[:, 1:], gray[:, -1:]], 1)
+        pair = torch.stack([gray, right], -1)
+        corners.append(torch.cat([pair, torch.cat([pair[1:], pair[-1:]])], -1).view(torch.int32).flatten())
+        levels.append([first, *gray.shape])
+        first += gray.numel()
+    return Others(torch.cat(corners), torch.tensor(levels).view(-1, LEVELS, 3), linear, b)
 
 
 def _run(name: str, gray: Tensor, patches: Patches, others: Others, stride: int, *values: Any) -> Patches:
     better = Patches(torch.empty_like(patches.planes), torch.empty_like(patches.alike))
-    arrays = *dense(gray, others.grays, dtype=torch.uint8), *dense(others.levels, dtype=torch.int64)
+    arrays = *dense(gray, dtype=torch.uint8), *dense(others.corners, dtype=torch.int32)
     count = len(others.levels)
-    compared = *gray.shape, *arrays, *dense(others.linear, others.b), count, stride
-    run_in_parts(f"mmpi_{name}", even_bounds(len(gray), 1), *compared, *dense(*patches), *values, *better)
+    compared = *gray.shape, *arrays, *dense(others.levels, dtype=torch.int64), *dense(others.linear, others.b)
+    run_in_parts(
+        f"mmpi_{name}", even_bounds(len(gray), 1), *compared, count, stride, *dense(*patches), *values, *better
+    )
     return better
 
 

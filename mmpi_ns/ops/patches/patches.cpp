@@ -6,6 +6,9 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#ifdef __AVX2__
+#include <immintrin.h>
+#endif
 
 namespace {
 
@@ -23,23 +26,29 @@ struct Plane {
     Lanes q, right, down;
 };
 
-// Four bytes from each of sixteen places; the first two are a pixel and its right neighbour.
-IntLanes pixels(const uint8_t* grays, IntLanes at) {
-    return each_lane<IntLanes>(at, [grays](int32_t i) {
-        int32_t four;
-        std::memcpy(&four, grays + i, sizeof four);
-        return four;
-    });
+// Sixteen numbers of a table.
+IntLanes gather(const int32_t* table, IntLanes at) {
+#ifdef __AVX2__
+    __m256i halves[2];
+    std::memcpy(halves, &at, sizeof at);
+    for (__m256i& half : halves) half = _mm256_i32gather_epi32(table, half, sizeof *table);
+    std::memcpy(&at, halves, sizeof at);
+    return at;
+#endif
+    return each_lane<IntLanes>(at, [table](int32_t i) { return table[i]; });
 }
 
-Lanes between(IntLanes pair, Lanes u) {
-    const Lanes left = real(pair & 255), right = real(pair >> 8 & 255);
-    return left + u * (right - left);
+// Between four bytes: a pixel, the one to its right, and the two below.
+Lanes between(IntLanes corners, Lanes u, Lanes v) {
+    const Lanes a = real(corners & 255), b = real(corners >> 8 & 255);
+    const Lanes c = real(corners >> 16 & 255), d = real(corners >> 24 & 255);
+    const Lanes upper = a + u * (b - a), lower = c + u * (d - c);
+    return upper + v * (lower - upper);
 }
 
 // Another image, and where the image's pixels at inverse depths are in it.
 struct Other {
-    const uint8_t* grays;
+    const int32_t* corners;
     const int64_t* sizes; // first pixel, height, width of each level
     const float* linear;
     const float* b;
@@ -81,12 +90,8 @@ struct Other {
             Lanes v = (middle[1] + to_right * right[1] + to_down * down[1]) * inverse * to_rows - 0.5f;
             u = pick(shown, least(most(u, Lanes{}), last_column), Lanes{}); // no number where nothing is shown
             v = pick(shown, least(most(v, Lanes{}), last_row), Lanes{});
-            const IntLanes left = truncated(least(u, last_column - 1.0f)), top = truncated(least(v, last_row - 1.0f));
-            const IntLanes corner = first + top * widths + left;
-            u -= real(left);
-            v -= real(top);
-            const Lanes upper = between(pixels(grays, corner), u), lower = between(pixels(grays, corner + widths), u);
-            seen[n] = upper + v * (lower - upper);
+            const IntLanes left = truncated(u), top = truncated(v);
+            seen[n] = between(gather(corners, first + top * widths + left), u - real(left), v - real(top));
             sum += seen[n];
         }
         Lanes their_squares{}, product{};
@@ -105,7 +110,8 @@ struct Other {
 // An image and what it is compared with.
 struct Image {
     int64_t height, width;
-    const uint8_t *gray, *grays;
+    const uint8_t* gray;
+    const int32_t* corners;
     const int64_t* sizes;
     const float *linear, *b;
     int64_t count, stride;
@@ -160,7 +166,7 @@ struct Pixels {
         Lanes first = splat(-1), second = splat(-1);
         Mask is_shown{};
         for (int64_t k = 0; k < of.count; k++) {
-            const Other other{of.grays, of.sizes + 3 * LEVELS * k, of.linear + 9 * k, of.b + 3 * k};
+            const Other other{of.corners, of.sizes + 3 * LEVELS * k, of.linear + 9 * k, of.b + 3 * k};
             const Lanes one = other.alike(values, squares, x, y, plane, of.stride, is_shown);
             second = most(second, least(first, one));
             first = most(first, one);
@@ -199,10 +205,10 @@ Plane turned(const Plane& plane, const Plane& turn, Lanes x, float y, const floa
 
 // Rows [begin, end) of an image: the better ones of two planes at each pixel.
 void mmpi_compare_planes(int64_t begin, int64_t end, int64_t height, int64_t width, const uint8_t* gray,
-                         const uint8_t* grays, const int64_t* sizes, const float* linear, const float* b, int64_t count,
+                         const int32_t* corners, const int64_t* sizes, const float* linear, const float* b, int64_t count,
                          int64_t stride, const float* planes, const float* alike, const float* others, float* best,
                          float* best_alike) {
-    const Image image{height, width, gray, grays, sizes, linear, b, count, stride};
+    const Image image{height, width, gray, corners, sizes, linear, b, count, stride};
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
             Pixels here(image, row, column, planes, alike);
@@ -213,10 +219,10 @@ void mmpi_compare_planes(int64_t begin, int64_t end, int64_t height, int64_t wid
 
 // Rows [begin, end) of an image: the best of each pixel's plane, those around it, and two that differ a little.
 void mmpi_spread_planes(int64_t begin, int64_t end, int64_t height, int64_t width, const uint8_t* gray,
-                        const uint8_t* grays, const int64_t* sizes, const float* linear, const float* b, int64_t count,
+                        const int32_t* corners, const int64_t* sizes, const float* linear, const float* b, int64_t count,
                         int64_t stride, const float* planes, const float* alike, const float* changes,
                         const float* pinhole, int64_t offset, float* best, float* best_alike) {
-    const Image image{height, width, gray, grays, sizes, linear, b, count, stride};
+    const Image image{height, width, gray, corners, sizes, linear, b, count, stride};
     const int64_t shifts[4][2] = {{-offset, 0}, {offset, 0}, {0, -offset}, {0, offset}};
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
