@@ -68,7 +68,7 @@ class Surfaces:
         inverse, kernel = self.inverse, np.ones((3, 3), np.uint8)
         nearest = cv2.dilate(inverse, kernel)
         farthest = cv2.erode(np.where(inverse > 0, inverse, np.inf).astype(np.float32), kernel)
-        steps = (inverse > 0) & (nearest > SAME * farthest)
+        steps = (inverse > 0) & (nearest / SAME > farthest)
         return Surfaces(self.planes, np.where(cv2.dilate(steps.astype(np.uint8), kernel) > 0, 0, self.error))
 
     def enlarged(self, shape: tuple[int, ...]) -> tuple[Map, Map]:
