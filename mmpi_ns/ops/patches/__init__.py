@@ -53,7 +53,8 @@ class Patches(NamedTuple):
     planes: Float[Tensor, "H W 3"]
     """Inverse depth at the pixel's centre, and its change for a pixel to the right and for one down."""
     alike: Float[Tensor, "H W"]
-    """Mean of the two largest correlations, ``UNSEEN`` for images that do not show it; -1 where there is none."""
+    """Mean of the two largest correlations (with one image: that), ``UNSEEN`` for images that do not show the patch;
+    -1 where none does."""
 
 
 @operation()
@@ -152,6 +153,7 @@ def _better(references: _References, patches: Patches, planes: Tensor, others: O
         alike, shown = _correlations(references, planes, others.corners, sizes, linear, b)
         second = torch.maximum(second, torch.minimum(best, alike))
         best, is_shown = torch.maximum(best, alike), is_shown | shown
+    second = best if len(others.b) == 1 else second
     flat = references.squares < LEAST_CONTRAST**2 * references.values.shape[-1]
     mean = torch.where(is_shown & ~flat & (planes[..., 0] > 0), (best + second) / 2, -1.0)
     better = mean > patches.alike
@@ -182,7 +184,7 @@ def _correlations(
     whole = (places[2] >= LEAST_SHARE * middle[2][..., None]).all(-1)
     depth = torch.where(whole[..., None], places[2], 1.0)
     column, row = (
-        (place / depth * (of / size)[..., None] - 0.5).clamp(min=0)
+        (place / depth * (of / size)[..., None] - 0.5).nan_to_num(0).clamp(min=0)
         for place, of, size in zip(places, (widths, heights), (width, height), strict=False)
     )
     column = torch.minimum(column, (widths - 1)[..., None].to(column.dtype))

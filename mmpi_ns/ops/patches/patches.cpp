@@ -171,7 +171,7 @@ struct Pixels {
             second = most(second, least(first, one));
             first = most(first, one);
         }
-        const Lanes mean = (first + second) * 0.5f;
+        const Lanes mean = of.count == 1 ? first : (first + second) * 0.5f;
         const Mask better = counts & is_shown & (mean > alike);
         alike = pick(better, mean, alike);
         best = {pick(better, plane.q, best.q), pick(better, plane.right, best.right),
