@@ -44,7 +44,7 @@ LARGE = 640
 LEAST_FLOW = 16
 """Pixels of an image's shorter side from which on it is matched at a reduced size."""
 SMALLEST = 12
-"""Pixels of the longer side that OpenCV's optical flow needs."""
+"""Pixels of the shorter side that optical flow needs."""
 ROUNDS = {False: (1, 1, 1), True: (2, 1)}
 """Rounds of matching, of small and of large images, each at the working size divided by this."""
 SEARCHED = {False: (1, 1), True: (1,)}
@@ -234,7 +234,7 @@ def _tasks(
 def matched(view: View, others: list[View], points: NDArray[np.float64], rounds: Sequence[int] | None = None) -> Depth:
     """The depths of a view by comparison with other views: planes at a low resolution, then optical flow, and planes
     again where that gives nothing. ``rounds`` of optical flow alone, if there are any."""
-    if not others or max(view.gray.shape) < SMALLEST:
+    if not others or min(view.gray.shape) < SMALLEST:
         return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)

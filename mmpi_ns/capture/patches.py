@@ -45,8 +45,8 @@ NOISE, MAX_RELATIVE = 0.75, 0.15
 SAME = 1.1
 """Inverse depths differ by at most this factor from the median around them, and those of one surface from pixel to
 pixel."""
-SPECK = 100
-"""Pixels of a surface, at least."""
+SPECK, MARGIN = 100, 3
+"""Pixels of a surface, at least, and across which nothing is kept about a step in depth."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,8 @@ class Surfaces:
         nearest = cv2.dilate(inverse, kernel)
         farthest = cv2.erode(np.where(inverse > 0, inverse, np.inf).astype(np.float32), kernel)
         steps = (inverse > 0) & (nearest / SAME > farthest)
-        return Surfaces(self.planes, np.where(cv2.dilate(steps.astype(np.uint8), kernel) > 0, 0, self.error))
+        near = cv2.dilate(steps.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8))
+        return Surfaces(self.planes, np.where(near > 0, 0, self.error))
 
     def enlarged(self, shape: tuple[int, ...]) -> tuple[Map, Map]:
         """Inverse depths and errors of an image of another size; both 0 where no plane is certain. [H, W] each"""
