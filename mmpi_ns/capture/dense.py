@@ -1,9 +1,9 @@
 """Depth of most pixels of the training images: dense matches between neighbouring views, each with its error.
 
-Every image is compared with its nearest neighbours. A rough depth, interpolated from SfM points, warps the neighbour
-into the image, so that the remaining displacement, found by DIS optical flow, is small. A match on its epipolar line
-gives an inverse depth; consistent matches of several neighbours are averaged. A large image is matched at half its size
-first; each round starts from the depths of the previous one. Threads share the images (OpenCV and NumPy release
+Every image is compared with its nearest neighbours. A rough depth, from SfM points and planes searched at a low
+resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by DIS
+optical flow, is small. A match on its epipolar line gives an inverse depth; consistent matches of several neighbours
+are averaged; where there are none, the planes' depths remain. Threads share the images (OpenCV and NumPy release
 Python's lock), and an image is in memory only while its neighbours are worked on.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
@@ -45,11 +45,10 @@ LEAST_FLOW = 16
 """Pixels of an image's shorter side from which on it is matched at a reduced size."""
 SMALLEST = 12
 """Pixels of the shorter side that optical flow needs."""
-ROUNDS = {False: (1, 1, 1), True: (2, 1)}
-"""Rounds of matching, of small and of large images, each at the working size divided by this."""
-SEARCHED = {False: (1, 1), True: (1,)}
-SECONDS = 0.8
-"""Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
+ROUNDS, SEARCHED = {False: (1, 1, 1), True: (2, 1)}, {False: (1, 1), True: (1,)}
+"""Rounds of matching, of small and of large images, at the working size divided by this; and with surfaces."""
+SECONDS, SEARCH_SECONDS = 0.55, 0.15
+"""Processor seconds for a million working pixels of an image, and for its surfaces, for the forecast."""
 STRIDE, ITERATIONS = {False: 5, True: 6}, 8
 """Pixels between patches of the optical flow, in small and in large images, and iterations."""
 NOISE, MAX_EPIPOLAR = 0.3, 1.0

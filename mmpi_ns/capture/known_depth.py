@@ -24,7 +24,7 @@ from torch import Tensor
 
 from mmpi_ns.capture.cache import Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
-from mmpi_ns.capture.dense import SECONDS, Depth, find_depths
+from mmpi_ns.capture.dense import SEARCH_SECONDS, SECONDS, Depth, find_depths
 from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.observe import POINT_ERROR, contradict, drop_masked, posed_images, see_points
 from mmpi_ns.capture.rays import Rays
@@ -165,7 +165,8 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
 
     def match() -> Iterable[Codes]:
         threads = num_threads()
-        seconds = SECONDS * 1e-6 * sum(float(min(1, width / w) ** 2 * w * h) for w, h in original.sizes) / threads
+        working = sum(float(min(1, width / w) ** 2 * w * h) for w, h in original.sizes)
+        seconds = (SECONDS * 1e-6 * working + SEARCH_SECONDS * len(shapes)) / threads
         CONSOLE.print(
             f"Matching {len(shapes)} images densely, at most {width} pixels wide: about {duration(seconds)} with "
             f"{threads} thread(s)."

@@ -102,8 +102,7 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
         shape, gray = small.gray.shape, _pixels(small)
         parallax = [Parallax.between(small, other.reduced(factor)).tensors for other in others]
         linear, b = (torch.stack(parts) for parts in zip(*parallax, strict=True))
-        sizes = [[max(1.0, factor / 2), factor, 2 * factor]] * len(others)
-        grays = [[_pixels(other.reduced(f)) for f in each] for other, each in zip(others, sizes, strict=True)]
+        grays = [[_pixels(other.reduced(f)) for f in (max(1.0, factor / 2), factor, 2 * factor)] for other in others]
         compared, pinhole = others_of(grays, linear, b), torch.from_numpy(small.pinhole).float()
         if patches is None:
             start = torch.zeros(*shape, 3)

@@ -39,7 +39,7 @@ class View:
     inside: NDArray[np.bool_]
     """[h, w] where the lens shows something."""
 
-    def reduced(self, factor: int) -> View:
+    def reduced(self, factor: float) -> View:
         """The view at one over ``factor`` of its size."""
         if factor == 1:
             return self
