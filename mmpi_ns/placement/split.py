@@ -14,7 +14,7 @@ from mmpi_ns.scene.windows import Window, WindowedPlan
 
 MARGIN = 0.08
 """Distance over which the share of a window falls off, as a fraction of the windows' length."""
-FEWEST = 4
+FEWEST = 8
 """Minimum training cameras of a window; smaller ones are merged with their neighbours."""
 SLACK = 1.1
 """Windows may be longer than configured by this factor."""
@@ -82,7 +82,7 @@ def find_balls(observations: Observations, length: float) -> list[tuple[Array, f
         counts = np.bincount(_nearest(centers, middles), minlength=len(middles))
         if counts.min() >= FEWEST:
             break
-        middles = np.delete(middles, counts.argmin(), axis=0)
+        middles = _settled(centers, np.delete(middles, counts.argmin(), axis=0))
     owner = _nearest(centers, middles)
     radii = [float(np.linalg.norm(centers[owner == i] - m, axis=-1).max()) for i, m in enumerate(middles)]
     # Neighbours follow each other: from the window farthest from the middle of all, always to the nearest.
