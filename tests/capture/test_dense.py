@@ -96,7 +96,7 @@ def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens, fishey
     cover = np.mean([(d.inverse > 0).mean() for _, d in found])
     error, scaled = relative_errors(found, POSES)
     assert cover > 0.9
-    assert np.median(error) < 0.003 and np.quantile(error, 0.9) < 0.02 and (error > 0.1).mean() < 0.035
+    assert np.median(error) < 0.003 and np.quantile(error, 0.9) < 0.02 and (error > 0.1).mean() < 0.04
     assert np.quantile(scaled, 0.9) < 2  # these walls are easier than the errors allow for
     assert all((d.error[d.inverse > 0] > 0).all() and not d.error[d.inverse == 0].any() for _, d in found)
 

@@ -92,7 +92,7 @@ def test_planes_are_slanted_as_the_walls_are():
     right = (np.gradient(inverse, axis=1) * factor)[np.ix_(rows, columns)]
     side = (surfaces.error > 0) & (np.abs(right) > 0.004)  # of the walls to the left and right
     assert side.sum() > 1000
-    assert np.median(np.abs(surfaces.planes[..., 1] / right - 1)[side]) < 0.1
+    assert np.median(np.abs(surfaces.planes[..., 1][side] / right[side] - 1)) < 0.1
     inverse_there, error = surfaces.enlarged(inverse.shape)
     certain = error > 0
     assert np.median(np.abs(inverse_there / inverse - 1)[certain]) < 0.02
