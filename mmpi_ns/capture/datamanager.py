@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
-from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells, with_hidden
+from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
 from mmpi_ns.capture.moving import moving_masks, share_of_moving
 from mmpi_ns.capture.moving_picture import draw_moving
 from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
@@ -150,11 +150,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 self.train_dataparser_outputs, self.observations, dataset, self.train_ray_generator,
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
-            seen = self.observations
+            self.known_depth, seen = depths, self.observations
             dataset.metadata[DEPTHS_KNOWN] = depths is not None and depths.share >= MANY_DEPTHS
             dataset.metadata[OBSERVATIONS] = seen if depths is None else of_cells(seen, depths, dataset)
-            if depths is not None:
-                self.known_depth = with_hidden(depths, seen, dataset, self.train_ray_generator)
             has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
             if not has_keypoints and (depths is None or depths.share == 0):
                 say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")

@@ -22,10 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from rich.progress import track
 from torch import Tensor
 
-from mmpi_ns.capture.cache import Computed, digest, held, remembered
+from mmpi_ns.capture.cache import Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
 from mmpi_ns.capture.dense import SECONDS, Depth, find_depths
-from mmpi_ns.capture.lone_depth import NEAREST, continued, is_lone
+from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.observe import POINT_ERROR, contradict, drop_masked, posed_images, see_points
 from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, shown_size, size_of
@@ -53,8 +53,6 @@ SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
 UNKNOWN, OCTAVE = -(2**15), 1024
 """Code of a number that is 0, and codes in an octave."""
-BYTES_OF_INVERSE = 4
-"""Of a pixel's inverse distance."""
 MOST_KEYPOINTS = 3.0
 """Multiple of the cells with a depth above which placement leaves keypoints out."""
 
@@ -259,36 +257,16 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
     return distances
 
 
-def with_hidden(known: KnownDepth, observations: Observations, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
-    """Extrapolates surfaces also where the other images have nearer ones before them, for the losses.
-
-    What one image shows there a field puts far behind, where all others hide it. Placement is better without.
-    """
-    posed = posed_images(observations, dataset)
-    return known if posed is None or not known.share else with_continued(known, posed, dataset, rays, hidden=True)
-
-
-def with_continued(
-    known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays, hidden: bool = False
-) -> KnownDepth:
+def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
     Masked pixels have no distance: what moves is nowhere.
-
-    Args:
-        known: depths of the training images.
-        posed: their cameras.
-        dataset: the images.
-        rays: makes rays through their pixel centres (image, row, column).
-        hidden: whether an image does not show what lies behind its known surfaces.
     """
-    # Neighbours mostly stand side by side.
-    inverse_of = held(lambda j: known.image(j)[..., 0], posed.sizes, BYTES_OF_INVERSE, NEAREST + 1) if hidden else None
 
     def codes_of(i: int) -> Codes:
         """Computed for every n-th pixel of a large image."""
-        codes, masked = np.array(known.codes[i]), ~dataset.usable(i)
-        codes[masked] = UNKNOWN
+        codes, hidden = np.array(known.codes[i]), ~dataset.usable(i)
+        codes[hidden] = UNKNOWN
         step = -(-max(codes.shape[:2]) // CONTINUED)
         rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
         pixels = np.stack(np.meshgrid(i, rows, columns, indexing="ij"), -1).reshape(-1, 3)
@@ -297,20 +275,20 @@ def with_continued(
         extended = continued(sparse, directions)
         down, across = np.nonzero(extended[..., 0])
         points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
-        seen = ~is_lone(posed, i, points, inverse_of)
+        seen = ~is_lone(posed, i, points)
         extended[down[seen], across[seen]] = 0
         for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
             part = codes[first : first + step]
             np.copyto(part, np.repeat(fine, step, 0)[: part.shape[1]], where=part[..., :1] == UNKNOWN)
-        codes[masked] = UNKNOWN
+        codes[hidden] = UNKNOWN
         return codes
 
     count = len(known.codes)
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
     contents = [digest((), codes) for codes in known.codes]
-    key = digest(posed.files, "hidden" if hidden else "continued", VERSION, *cameras, contents, masks)
-    work = "Extrapolating hidden surfaces" if hidden else "Extrapolating surfaces"
+    key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
+    work = "Extrapolating surfaces"
     return _from_cache(key, lambda: track(in_order(codes_of, range(count)), work, count, console=CONSOLE))
 
 

@@ -8,14 +8,14 @@ for any lens. So w.v is fitted to the inverse distances of the known pixels arou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Map, look_up, project
+from mmpi_ns.capture.views import Map, project
 from mmpi_ns.scene.near_views import nearest_views
 
 WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)
@@ -31,9 +31,7 @@ MOST_ERROR = 0.3
 NEAREST = 16
 """Nearby images that are checked for a point."""
 MOST_OTHERS = 1
-"""Other images that may show a lone point; with more, matches and colours are more reliable."""
-HIDDEN = 0.1
-"""A point is hidden in an image whose known surface there has an inverse distance larger by this share."""
+"""Other images in which a lone point may lie; with more, matches and colours are more reliable."""
 
 
 def continued(depths: Map, directions: Map) -> Map:
@@ -104,34 +102,13 @@ def _dot(a: Sequence[NDArray[np.float64]], b: Sequence[NDArray[np.float64]]) -> 
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def is_lone(
-    posed: PosedImages,
-    i: int,
-    points: NDArray[np.float64],
-    inverse_of: Callable[[int], NDArray[np.float32]] | None = None,
-) -> NDArray[np.bool_]:
-    """Whether at most ``MOST_OTHERS`` images near image i may show each of its points.
-
-    An image does not show a point outside its borders or, if depths are given, behind a surface that is known in it.
-
-    Args:
-        posed: the images.
-        i: one of them.
-        points: in the scene. [P, 3]
-        inverse_of: inverse distances of the pixels of an image, 0 where unknown. [H, W] None: nothing hides a point.
-
-    Returns:
-        [P]
-    """
+def is_lone(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether at most ``MOST_OTHERS`` images near image i may show each of its points [P, 3]. [P]"""
     count, lone = np.zeros(len(points), np.int64), np.arange(len(points))
     for j in nearest_views(posed.camera_to_worlds, i, NEAREST):
         if not len(lone):
             break
         at = project(posed, j, points[lone])
-        shown = ((at >= 0) & (at <= posed.sizes[j])).all(-1)
-        if inverse_of is not None:
-            distance = np.linalg.norm(points[lone] - posed.camera_to_worlds[j, :, 3], axis=-1)
-            shown &= look_up(inverse_of(j), *at.T, nearest=True) * distance <= 1 + HIDDEN
-        count[lone] += shown
+        count[lone] += ((at >= 0) & (at <= posed.sizes[j])).all(-1)
         lone = lone[count[lone] <= MOST_OTHERS]
     return count <= MOST_OTHERS

@@ -107,48 +107,26 @@ def posed(*places, lens=(0.0, 0.0, 0.0, 0.0)):
     return PosedImages((Path(__file__),) * count, poses, intrinsics, sizes, np.tile(lens, (count, 1)).astype(float))  # type: ignore[arg-type]
 
 
-def nothing(_: int):
-    """An image without a known depth."""
-    return np.zeros((HEIGHT, WIDTH), F32)
-
-
 def test_a_point_is_lone_that_at_most_one_other_image_shows():
     """The second camera stands further on: it sees the middle of what the first one sees, nothing behind itself."""
     images = posed((0, 0, 0), (0, 0, -3), (0, 0, -3.5))
     points = np.array([[0.0, 0, -10], [7.0, 0, -10], [0.0, 0, -2], [5.4, 0.0, -10]])
-    lone = [False, True, True, True]  # borders: 0.8 (10 - 3), 0.8 (10 - 3.5)
-    assert is_lone(images, 0, points, nothing).tolist() == lone
-    assert is_lone(images, 1, points[:1], nothing).tolist() == [False]
-    assert is_lone(posed((0, 0, 0)), 0, points, nothing).tolist() == [True] * 4
-    assert is_lone(images, 0, np.zeros((0, 3)), nothing).shape == (0,)
-
-
-@pytest.mark.parametrize(("wall", "lone"), [(4.0, True), (6.2, True), (6.5, False), (20.0, False), (0.0, False)])
-def test_a_point_behind_what_others_show_is_lone(wall, lone):
-    """Two images beside the first have a wall at this distance (0: none is known); the point is 7 away."""
-    images = posed((0, 0, 0), (0.2, 0, 0), (0.4, 0, 0))
-    inverse = plane((0, 0, -1), wall, directions()).astype(F32) if wall else nothing(0)
-    assert is_lone(images, 0, np.array([[0.3, 0, -7.0]]), lambda _: inverse).tolist() == [lone]
+    assert is_lone(images, 0, points).tolist() == [False, True, True, True]  # borders: 0.8 (10 - 3), 0.8 (10 - 3.5)
+    assert is_lone(images, 1, points[:1]).tolist() == [False]
+    assert is_lone(posed((0, 0, 0)), 0, points).tolist() == [True] * 4
+    assert is_lone(images, 0, np.zeros((0, 3))).shape == (0,)
 
 
 def test_lone_points_are_those_of_every_image_by_itself():
-    """Images of random depths, known at half of their pixels, looked up pixel by pixel."""
     rng = np.random.default_rng(0)
     images = posed(*rng.uniform(-2, 2, (9, 3)))
-    inverse = (1 / rng.uniform(1, 15, (9, HEIGHT, WIDTH)) * (rng.random((9, HEIGHT, WIDTH)) < 0.5)).astype(F32)
     points = rng.uniform([-12, -9, -15], [12, 9, 1], (5000, 3))
-    count, hidden = np.zeros(len(points), int), 0
+    count = np.zeros(len(points), int)
     for j in range(1, 9):
         away = points - images.camera_to_worlds[j, :, 3]
         x, y = (FOCAL * away[:, k] / np.minimum(away[:, 2], -1e-9) for k in (0, 1))
-        inside = (away[:, 2] < 0) & (np.abs(x) <= WIDTH / 2) & (np.abs(y) <= HEIGHT / 2)
-        for p in np.nonzero(inside)[0]:
-            column, row = int(WIDTH / 2 - x[p]), int(HEIGHT / 2 + y[p])
-            before = inverse[j, row, column] * np.sqrt((away[p] ** 2).sum()) > 1.1
-            count[p] += not before
-            hidden += before
-    assert np.array_equal(is_lone(images, 0, points, lambda j: inverse[j]), count <= 1)
-    assert {0, 1, 2, 3} <= set(count) and hidden > 1000
+        count += (away[:, 2] < 0) & (np.abs(x) <= WIDTH / 2) & (np.abs(y) <= HEIGHT / 2)
+    assert np.array_equal(is_lone(images, 0, points), count <= 1) and {0, 1, 2, 3} <= set(count)
 
 
 @pytest.mark.parametrize("between", [0, 1])
@@ -188,24 +166,3 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, mo
         assert added[~middle()].mean() > 0.8
     assert first[added][:, 0] == pytest.approx(exact[added], rel=0.02)
     assert np.array_equal(first[middle()], KnownDepth(list(map(packed, known))).image(0)[middle()])
-
-
-def test_a_surface_goes_on_behind_what_other_images_know(monkeypatch, tmp_path):
-    """Three images side by side: the first knows a far wall in its middle, the others a near one all over."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    images, d = posed((0, 0, 0), (0.1, 0, 0), (0.2, 0, 0)), directions()
-    far, near = plane((0, 0, -1), 7, d), plane((0, 0, -1), 4, d)
-    known = KnownDepth(list(map(packed, (seen(far, middle()), *[seen(near, near > 0)] * 2))))
-    cameras = Cameras(
-        torch.tensor(images.camera_to_worlds).float(), FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, width=WIDTH, height=HEIGHT
-    )
-    dataset: Any = SimpleNamespace(has_masks=False, usable=lambda i: np.ones((HEIGHT, WIDTH), bool))
-    shown, hidden = (
-        with_continued(known, images, dataset, RayGenerator(cameras), hidden=hidden).image(0)
-        for hidden in (False, True)
-    )
-    unseen = d[..., 0] / -d[..., 2] * 7 < -0.8 * 7 + 0.2  # left of what the third image shows
-    assert not shown[..., 0][~middle() & ~unseen].any()
-    added = (hidden[..., 0] > 0) & ~middle()
-    assert added[~middle()].mean() > 0.8
-    assert hidden[added][:, 0] == pytest.approx(far[added], rel=0.02)
