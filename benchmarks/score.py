@@ -20,7 +20,7 @@ class ScoreRow(Bench, Score):
     given: str = ""
     """What that was given beside the training images, for the row."""
     seconds: float = 0.0
-    """How long it was trained, for the row: seconds of processors."""
+    """How long it was trained, for the row."""
     frame: float = 0.0
     """Seconds in which it renders a test image, for the row."""
     memory: float = 0.0
@@ -49,7 +49,7 @@ def markdown(content: Row) -> str:
         "method": "{method}",
         "scene": "{scene}",
         "was given": "{given}",
-        "training, processor s": lambda r: f"{r['seconds']:.0f}" if r["seconds"] else "",
+        "training, s": lambda r: f"{r['seconds']:.0f}" if r["seconds"] else "",
         "memory, GiB": lambda r: f"{r['memory']:.1f}" if r.get("memory") else "",
         "frame, s": lambda r: f"{r['frame']:.2g}" if r.get("frame") else "",
         "test images": "{images}",
