@@ -21,6 +21,10 @@ class ScoreRow(Bench, Score):
     """What that was given beside the training images, for the row."""
     seconds: float = 0.0
     """How long it was trained, for the row."""
+    frame: float = 0.0
+    """Seconds in which it renders a test image, for the row."""
+    memory: float = 0.0
+    """Peak of its training, GiB, for the row."""
     remark: str = ""
     """For the row."""
 
@@ -31,7 +35,8 @@ class ScoreRow(Bench, Score):
         report = Report(self)
         scene = f"{self.data.resolve().name} /{self.downscale_factor}"
         row: Row = {"method": self.method, "scene": scene, "given": self.given, "seconds": self.seconds}
-        row |= {"remark": self.remark, "images": len(found), **means, "each": dict(found)}
+        row |= {"frame": self.frame, "memory": self.memory, "remark": self.remark}
+        row |= {"images": len(found), **means, "each": dict(found)}
         row |= {"command": report.content["made"]["command"]}
         report.rows[f"{self.method} on {scene}, {len(found)} images"] = row
         head = {f"{key}: {k}": r[k] for key, r in report.rows.items() for k in means if k in r}
@@ -45,9 +50,12 @@ def markdown(content: Row) -> str:
         "scene": "{scene}",
         "was given": "{given}",
         "training, s": lambda r: f"{r['seconds']:.0f}" if r["seconds"] else "",
+        "memory, GiB": lambda r: f"{r['memory']:.1f}" if r.get("memory") else "",
+        "frame, s": lambda r: f"{r['frame']:.2g}" if r.get("frame") else "",
         "test images": "{images}",
         "PSNR": "{psnr:.2f}",
         "SSIM": lambda r: f"{r['ssim']:.3f}" if "ssim" in r else "",
+        "PSNR, colours fitted": lambda r: f"{r['cc_psnr']:.2f}" if "cc_psnr" in r else "",
         "LPIPS": lambda r: next((f"{v:.3f} ({k[6:]})" for k, v in r.items() if k.startswith("lpips")), "no weights"),
         "remark": "{remark}",
     }

@@ -22,7 +22,8 @@ SAME_DB = 119.0
 """Images whose PSNR is above this are equal but for rounding (``ImageMetrics`` ends at 120)."""
 PROTOCOL = """\
 PSNR of an image is -10 log10 of the mean squared error over its pixels and colours (0 to 1), SSIM torchmetrics' with
-its defaults, LPIPS torchmetrics' with the network that is named. All are means over the test images."""
+its defaults, LPIPS torchmetrics' with the network that is named. Colours are fitted by an affine map of each rendering
+to its test image. All are means over the test images."""
 Scores = list[tuple[str, dict[str, float]]]
 """Name and metrics of each image."""
 
@@ -70,7 +71,8 @@ class Score:
         if min(values["psnr"] for _, values in scores) > SAME_DB:
             raise ValueError(f"{self.images} holds the test images themselves: give the folder of the renderings.")
         means = {k: float(np.mean([values[k] for _, values in scores])) for k in scores[0][1]}
-        print(summary(scores) + "".join(f", {k} {v:.3f}" for k, v in means.items() if k.startswith("lpips")))
+        others = (f", {k} {v:.3f}" for k, v in means.items() if k.startswith(("cc_psnr", "lpips")))
+        print(summary(scores) + "".join(others))
         print(PROTOCOL)
         return scores, means
 

@@ -46,7 +46,7 @@ def score_row(rendered: Path, scene: Path, **settings) -> None:
 
 
 def test_scores_follow_the_definition_and_a_row_is_kept(rendered, scene, tests_of, capsys):
-    score_row(rendered, scene, method="dark", given="poses", seconds=12.0)
+    score_row(rendered, scene, method="dark", given="poses", seconds=12.0, frame=0.05, memory=1.5)
     score_row(rendered, scene, method="again")
     wanted = []
     for image, off in zip(tests_of.values(), (10, 30), strict=True):
@@ -59,7 +59,7 @@ def test_scores_follow_the_definition_and_a_row_is_kept(rendered, scene, tests_o
     assert [v["psnr"] for v in row["each"].values()] == pytest.approx(wanted, abs=1e-4)
     said, text = capsys.readouterr().out, (rendered.parent / "results" / "score.md").read_text()
     assert f"2 images: PSNR {np.mean(wanted):.2f} dB" in said and "torchmetrics" in said
-    assert f"| dark | {scene.name} /1 | poses | 12 | 2 | {np.mean(wanted):.2f} |" in text
+    assert f"| dark | {scene.name} /1 | poses | 12 | 1.5 | 0.05 | 2 | {np.mean(wanted):.2f} |" in text
 
 
 def test_the_command_writes_nothing(rendered, scene):
