@@ -141,11 +141,9 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
 def _sort(live: Tensor, slots: int) -> Op:
     """Merging by one stable sort, as the plain path does (the compiled march merges as it goes)."""
     count, width = int(live.sum()), int(live.max())
-    starts = live.cumsum(0) - live
     rays = torch.repeat_interleave(torch.arange(len(live), device=live.device), live)
-    places = rays * width + torch.arange(count, device=live.device) - starts[rays]
     keys = torch.rand(count, generator=torch.Generator().manual_seed(slots)).to(live.device)
-    return Op("merge by a sort", lambda: merge(places, keys, live, False), count * (8 + 4) + len(live) * width * 9)
+    return Op("merge by a sort", lambda: merge(rays, keys, live), count * (8 + 4) + len(live) * width * 9)
 
 
 def _index(rows: Tensor, table_rows: int, distinct: float) -> Op:

@@ -28,7 +28,7 @@ from mmpi_ns.prepare.alignment import camera_poses, choose_frame
 from mmpi_ns.prepare.images import Photo, in_short, make_cameras, parse_camera
 from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.poses import read_poses
-from mmpi_ns.prepare.settings import Settings, check_options, read_lists
+from mmpi_ns.prepare.settings import Settings, check_settings, read_lists
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.prepare.video import select_frames
 from mmpi_ns.utils.errors import InputError, progress, quoted, say
@@ -361,7 +361,7 @@ def prepare(settings: Settings) -> Verdict:
     """Makes the scene; returns how far it can be believed. Raises InputError if the input is missing or cannot be
     made into a scene, or something would be lost in its folder."""
     load_pycolmap()  # in a version that is new enough
-    check_options(settings)
+    check_settings(settings)
     source, scene = settings.input.resolve(), settings.scene.resolve()
     if not source.exists():
         raise InputError(f"{settings.input} does not exist.")

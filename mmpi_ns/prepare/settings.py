@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,6 +12,7 @@ import tyro
 from mmpi_ns.prepare.features import Matching
 from mmpi_ns.prepare.images import Lens, Sharing
 from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.values import Number, check_options
 
 
 @dataclass(frozen=True)
@@ -81,29 +81,26 @@ class Settings:
     """CPU threads; -1 for all cores."""
 
 
-def check_options(s: Settings) -> None:
+RANGES = {
+    **dict.fromkeys(("focal", "camera_height", "frame_motion"), Number(0, above=True)),
+    **dict.fromkeys(("overlap", "max_features"), Number(1, whole=True)),
+    **dict.fromkeys(("train_every", "max_frames", "downscales"), Number(2, whole=True)),
+    "camera": Number(),
+}
+
+
+def check_settings(s: Settings) -> None:
     """Checks the options before any work. Raises InputError if one is out of range, contradicts another, or names no
     file."""
-    numbers = {
-        "--focal": s.focal, "--camera-height": s.camera_height, "--frame-motion": s.frame_motion,
-        "--overlap": s.overlap, "--max-features": s.max_features,
-    }  # fmt: skip
-    for option, value in numbers.items():
-        if value is not None and not 0 < value < float("inf"):
-            raise InputError(f"{option} must be a positive number, not {value}.")
-    if s.camera is not None and not all(map(isfinite, s.camera)):
-        raise InputError(f"--camera takes finite numbers, not {s.camera}.")
+    check_options(s, {name: number for name, number in RANGES.items() if getattr(s, name) is not None}, "--")
     if s.focal is not None and s.camera is not None:
         raise InputError("--focal and --camera both give a focal length: leave one out.")
     if s.test_every is not None and s.train_every is not None:
         raise InputError("--test-every and --train-every contradict each other: leave one out.")
-    for option, value in (("--test-every", s.test_every or None), ("--train-every", s.train_every)):
-        if value is not None and value < 2:
-            raise InputError(f"{option} takes 2 or more, not {value} (--test-every 0: all images train and test).")
-    if s.max_frames < 2:
-        raise InputError(f"--max-frames {s.max_frames}: a scene needs at least two views.")
-    if any(f < 2 for f in s.downscales) or len(set(s.downscales)) < len(s.downscales):
-        raise InputError(f"--downscales takes different whole numbers from 2 on, not {s.downscales}.")
+    if s.test_every is not None and s.test_every != 0 and s.test_every < 2:
+        raise InputError(f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.")
+    if len(set(s.downscales)) < len(s.downscales):
+        raise InputError(f"--downscales takes different numbers, not {s.downscales}.")
     if s.threads < 1 and s.threads != -1:
         raise InputError(f"--threads takes a number of threads, or -1 for all cores, not {s.threads}.")
     if s.refine_poses and s.poses is None:

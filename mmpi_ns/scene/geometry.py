@@ -218,11 +218,10 @@ def local_to_ndc(
 
 @dataclass(frozen=True)
 class Cube:
-    """The centred cube as tensors: bounds, voxels a side (z, y, x order) and the distance between samples."""
+    """The centred cube: its bounds as tensors, and the distance between samples."""
 
     lower: Float[Tensor, "3"]
     upper: Float[Tensor, "3"]
-    shape: Int[Tensor, "3"]
     step: float
 
     @staticmethod
@@ -232,8 +231,7 @@ class Cube:
         lower = torch.tensor(plan.lower, dtype=dtype, device=device)
         upper = torch.tensor(plan.upper, dtype=dtype, device=device)
         sides = [(b - a) / (n - 1) for a, b, n in zip(plan.lower, plan.upper, reversed(plan.shape), strict=True)]
-        shape = torch.tensor(plan.shape, device=device)
-        return Cube(lower, upper, shape, min(sides) / samples_per_voxel)
+        return Cube(lower, upper, min(sides) / samples_per_voxel)
 
     def normalised(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
         """World points to [-1, 1]^3 over the cube."""

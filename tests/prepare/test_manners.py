@@ -36,7 +36,7 @@ def frames(tmp_path):
     [
         ({"focal": NAN}, "--focal"), ({"focal": -3.0}, "--focal"), ({"camera_height": 0.0}, "--camera-height"),
         ({"camera": (NAN, 1.0, 1.0)}, "--camera"), ({"camera": (9.0, 1.0, 1.0), "focal": 9.0}, "leave one out"),
-        ({"test_every": 1}, "--test-every"), ({"test_every": -4}, "--test-every"), ({"train_every": 0}, "takes 2"),
+        ({"test_every": 1}, "--test-every"), ({"test_every": -4}, "--test-every"), ({"train_every": 0}, "at least 2"),
         ({"test_every": 4, "train_every": 4}, "contradict"), ({"downscales": (2, 0)}, "--downscales"),
         ({"downscales": (2, 2)}, "--downscales"), ({"refine_poses": True}, "--poses"), ({"overlap": 0}, "--overlap"),
         ({"threads": 0}, "--threads"), ({"max_frames": 1}, "--max-frames"),

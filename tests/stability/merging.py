@@ -69,10 +69,9 @@ def _merge_order(keys: Array, precision: Precision, empty: bool = False) -> Outc
     per_ray = counts.sum(-1)
     # As the sampler lists them: head by head, and ray by ray within it.
     flat = [(k, r, i) for k in range(heads) for r in range(rays) for i in range(counts[r, k])]
-    slots = [r * int(per_ray.max()) + counts[r, :k].sum() + i for k, r, i in flat]
     distances = float32([keys[r, k, i] for k, r, i in flat])
     with precision.context():
-        index, valid = merge(torch.tensor(slots), distances, torch.tensor(per_ray), False)
+        index, valid = merge(torch.tensor([r for _, r, _ in flat]), distances, torch.tensor(per_ray))
     wrong = 0
     for ray in range(rays):
         wanted = [n for *_, n in sorted((-keys[r, k, i], k, i, n) for n, (k, r, i) in enumerate(flat) if r == ray)]
@@ -87,12 +86,14 @@ def _dropping(taus: Array, threshold: float, share: float, precision: Precision,
     rays, samples = taus.shape
     merged = (torch.arange(rays * samples).view(rays, samples), torch.ones(rays, samples, dtype=torch.bool))
     with precision.context():
-        found = prune(*merged, float32(taus.ravel()), threshold, share)
+        order, valid, skipped_before, skipped_total, dropped_mass = prune(
+            *merged, float32(taus.ravel()), threshold, share
+        )
     errors, wrong, roundings = [], 0, 4 + math.log2(samples)
     for r in range(rays):
-        made, bound, there = exact.composite(taus[r]), min(threshold, share / samples), found.valid[r]
+        made, bound, there = exact.composite(taus[r]), min(threshold, share / samples), valid[r]
         kept = np.zeros(samples, bool)
-        kept[(found.order[r][there] - r * samples).tolist()] = True
+        kept[(order[r][there] - r * samples).tolist()] = True
         size = made.weights * (1 - np.log(np.maximum(made.in_front, 1e-300)))
         unclear = np.abs(made.weights - bound) <= 16 * UNIT * size
         wrong += int(((kept != (made.weights > bound)) & ~unclear).sum()) + (keeps_all and not kept.all())
@@ -100,9 +101,9 @@ def _dropping(taus: Array, threshold: float, share: float, precision: Precision,
         before = (np.cumsum(dropped) - dropped)[kept]
         total, mass = dropped.sum(), made.weights[~kept].sum()
         errors += [
-            compare(found.skipped_before[r][there], before, before + total * 2.0**-20, roundings),
-            compare(found.skipped_total[r], [total], total, roundings),
-            compare(found.dropped_mass[r], [mass], size.sum(), roundings),
+            compare(skipped_before[r][there], before, before + total * 2.0**-20, roundings),
+            compare(skipped_total[r], [total], total, roundings),
+            compare(dropped_mass[r], [mass], size.sum(), roundings),
         ]
     return Outcome.of(errors, wrong=wrong)
 

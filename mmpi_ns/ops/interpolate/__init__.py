@@ -145,7 +145,6 @@ def sum_rows(
     return out.index_add_(0, positions.reshape(-1), each)
 
 
-@operation()
 def raise_peaks(
     peaks: Float[Tensor, "K"], rows: Int[Tensor, "U"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N"]
 ) -> None:
@@ -306,11 +305,3 @@ def take_rows_on_cpu(table: Tensor, rows: Tensor) -> Tensor:
     values = torch.empty(len(rows), table.shape[1])
     call_in_parts("mmpi_take_rows", len(rows), rows.contiguous(), table.shape[1], table, values, least=AT_LEAST)
     return values
-
-
-@raise_peaks.on_cpu
-def raise_peaks_on_cpu(peaks: Tensor, rows: Tensor, positions: Tensor, weights: Tensor) -> None:
-    if positions.dtype != torch.int32:
-        return raise_peaks.reference(peaks, rows, positions, weights)
-    samples = (positions.contiguous(), weights.contiguous(), positions.shape[1])
-    call_in_parts("mmpi_raise_peaks", len(positions), *samples, rows.contiguous(), peaks, least=AT_LEAST)

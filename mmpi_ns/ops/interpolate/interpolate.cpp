@@ -54,18 +54,6 @@ void mmpi_take_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t cha
     }
 }
 
-// peaks[brick] is raised to the largest weight of those of samples [begin, end) that read one of its rows.
-void mmpi_raise_peaks(int64_t begin, int64_t end, const int32_t* positions, const float* weights, int64_t taps,
-                      const int64_t* rows, float* peaks) {
-    for (int64_t i = begin * taps; i < end * taps; i++) {
-        float* peak = peaks + rows[positions[i]] / BRICK;
-        float weight = weights[i / taps], now;
-        __atomic_load(peak, &now, __ATOMIC_RELAXED);
-        while (now < weight && !__atomic_compare_exchange(peak, &now, &weight, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
-            ;
-    }
-}
-
 // The sum of weights[n, b] * table[positions[n, b]] over b, of samples [begin, end).
 void mmpi_weigh_rows(int64_t begin, int64_t end, const float* numbers, int64_t rows, int64_t channels,
                      const int32_t* positions, const float* weights, int64_t taps, float* values) {
@@ -129,7 +117,6 @@ IN_PARTS(mmpi_count_rows)
 IN_PARTS(mmpi_list_rows)
 IN_PARTS(mmpi_place_rows)
 IN_PARTS(mmpi_take_rows)
-IN_PARTS(mmpi_raise_peaks)
 IN_PARTS(mmpi_weigh_rows)
 IN_PARTS(mmpi_sum_rows)
 IN_PARTS(mmpi_count_heads)

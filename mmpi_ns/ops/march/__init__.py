@@ -8,7 +8,6 @@ must weigh to be kept), so a ray costs what lies in front of its first surfaces.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -58,20 +57,18 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     hits = plane_hits(*rays[:4], layout.frames)
     first, counts, explained = crossings(layout, rays, hits)
     flat = _live_samples(layout, tables, rays, hits, first, counts)
-    per_ray, number = counts.sum(-1), torch.cat([_enumerate(each)[1] for each in counts.unbind(-1)])
-    width, before = max(1, int(per_ray.max())) if per_ray.numel() else 1, counts.cumsum(-1) - counts
-    slots = flat.rays * width + before[flat.rays, flat.heads] + number
-    order, valid = merge(slots, flat.inverse_t, per_ray, presorted=bool(((counts > 0).sum(-1) <= 1).all()))
+    per_ray = counts.sum(-1)
+    order, valid = merge(flat.rays, flat.inverse_t, per_ray)
     tau = flat.tau
     if options.blends and tau.numel():
         local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
         tau = _blend_visible(order, valid, flat, local, layout, tables)
-    pruned = prune(order, valid, tau, options.threshold, options.fair_share)
-    order = torch.where(pruned.valid, pruned.order, len(tau))  # empty slots take the zeros behind the samples
+    order, valid, *skipped = prune(order, valid, tau, options.threshold, options.fair_share)
+    order = torch.where(valid, order, len(tau))  # empty slots take the zeros behind the samples
     columns = (flat.heads, flat.planes, flat.ndc, flat.inverse_t, tau)
     heads, planes, ndc, inverse_t, tau = (torch.cat([x, x.new_zeros(1, *x.shape[1:])])[order] for x in columns)
-    rest = (pruned.skipped_before, pruned.valid, pruned.skipped_total, pruned.dropped_mass)
-    return MergedSamples(heads, planes, ndc, inverse_t, tau, *rest, live=per_ray, explained=explained)
+    before, total, mass = skipped
+    return MergedSamples(heads, planes, ndc, inverse_t, tau, before, valid, total, mass, per_ray, explained)
 
 
 @operation("gpu")
@@ -192,36 +189,26 @@ def _enumerate(counts: Int[Tensor, "R"]) -> tuple[Int[Tensor, "N"], Int[Tensor, 
 
 
 def merge(
-    slots: Int[Tensor, "N"],
-    inverse_t: Float[Tensor, "N"],
-    counts: Int[Tensor, "R"],
-    presorted: bool,
+    rays: Int[Tensor, "N"], inverse_t: Float[Tensor, "N"], counts: Int[Tensor, "R"]
 ) -> tuple[Int[Tensor, "R S"], Bool[Tensor, "R S"]]:
     """Sort flat samples along their rays, nearest first.
 
-    Ties keep the order of the slots, which run over (head, plane), so the result does not depend on the batch.
+    Ties keep the order of the list, which runs over (head, plane), so the result does not depend on the batch.
 
     Args:
-        slots: for each flat sample ray * S + position, positions counting (head, plane) within the ray.
+        rays: ray of each flat sample.
         inverse_t: inverse distance of each flat sample.
         counts: samples of each ray; S = counts.max().
-        presorted: every ray met one head only, whose planes already come near to far.
 
     Returns:
         Index of each slot's sample in the flat list (0 in empty slots), and which slots hold one.
     """
-    width = max(1, int(counts.max())) if counts.numel() else 1
-    num_rays = counts.shape[0]
-    index = torch.zeros(num_rays * width, dtype=torch.int64, device=slots.device)
-    index[slots] = torch.arange(slots.shape[0], device=slots.device)
-    index = index.view(num_rays, width)
-    valid = torch.arange(width, device=slots.device) < counts[:, None]
-    if presorted:
-        return index, valid
-    keys = torch.full((num_rays * width,), -1.0, dtype=inverse_t.dtype, device=slots.device)
-    keys[slots] = inverse_t
-    _, permutation = torch.sort(keys.view(num_rays, width), dim=-1, descending=True, stable=True)
-    return index.gather(-1, permutation), valid
+    by_ray, width = torch.argsort(rays, stable=True), max(1, int(counts.max())) if counts.numel() else 1
+    valid = torch.arange(width, device=rays.device) < counts[:, None]
+    index, keys = torch.zeros_like(valid, dtype=torch.int64), torch.full_like(valid, -1.0, dtype=inverse_t.dtype)
+    index[valid], keys[valid] = by_ray, inverse_t[by_ray]
+    _, nearest = torch.sort(keys, dim=-1, descending=True, stable=True)
+    return index.gather(-1, nearest), valid
 
 
 # Blend ---------------------------------------------------------------------------------------------------------------
@@ -262,23 +249,9 @@ def _blend_visible(
 # Prune ---------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Pruned:
-    """The kept samples, packed to the left, and the attenuation by the dropped ones."""
-
-    order: Int[Tensor, "R S"]
-    """Index into the flat list (0 in empty slots)."""
-    valid: Bool[Tensor, "R S"]
-    skipped_before: Float[Tensor, "R S"]
-    """Optical depth of the dropped samples in front of each kept sample."""
-    skipped_total: Float[Tensor, "R 1"]
-    dropped_mass: Float[Tensor, "R 1"]
-    """Sum of the weights of the dropped samples."""
-
-
 def prune(
     order: Int[Tensor, "R S"], valid: Bool[Tensor, "R S"], tau: Float[Tensor, "N"], threshold: float, fair_share: float
-) -> Pruned:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Keep the samples whose weight exceeds min(threshold, fair_share / samples on the ray).
 
     The second bound matters at the start, when all weights are 1/L: a fixed threshold would keep nothing, and samples
@@ -290,30 +263,22 @@ def prune(
         tau: blended optical depth of the flat samples.
         threshold: weight below which a sample is dropped once the field has sharpened; 0 keeps all.
         fair_share: the bound relative to equal weights; inf for the threshold alone.
+
+    Returns:
+        ``order`` and ``valid`` of the kept samples, packed to the left, and ``skipped_before``, ``skipped_total`` and
+        ``dropped_mass`` of ``MergedSamples``.
     """
     depth = torch.where(valid, tau[order] if tau.numel() else 0.0, 0.0)
     weights = torch.exp(-exclusive_cumsum(depth)) * -torch.expm1(-depth)
-    count = valid.sum(-1, keepdim=True).clamp(min=1)
-    bound = (fair_share / count).clamp(max=threshold)
+    bound = (fair_share / valid.sum(-1, keepdim=True).clamp(min=1)).clamp(max=threshold)
     kept = valid & (weights > bound) if threshold > 0 else valid
-    skipped = torch.where(kept, torch.zeros_like(depth), depth)
-    before = exclusive_cumsum(skipped)
-
-    number = kept.sum(-1)
-    width = max(1, int(number.max())) if number.numel() else 1
-    rays, positions = kept.nonzero(as_tuple=True)
-    target = rays * width + torch.arange(rays.shape[0], device=rays.device) - (number.cumsum(0) - number)[rays]
-    kept_order = torch.zeros(kept.shape[0] * width, dtype=torch.int64, device=tau.device)
-    kept_order[target] = order[rays, positions]
-    skipped_before = torch.zeros(kept.shape[0] * width, dtype=depth.dtype, device=tau.device)
-    skipped_before[target] = before[rays, positions]
-    return Pruned(
-        order=kept_order.view(-1, width),
-        valid=torch.arange(width, device=tau.device) < number[:, None],
-        skipped_before=skipped_before.view(-1, width),
-        skipped_total=skipped.sum(-1, keepdim=True),
-        dropped_mass=torch.where(kept, 0.0, weights).sum(-1, keepdim=True),
-    )
+    skipped = torch.where(kept, 0.0, depth)
+    width = max(1, int(kept.sum(-1).max())) if kept.numel() else 1
+    packed = torch.argsort((~kept).to(torch.int8), dim=-1, stable=True)[:, :width]
+    there = kept.gather(-1, packed)
+    before = torch.where(there, exclusive_cumsum(skipped).gather(-1, packed), 0.0)
+    mass = torch.where(kept, 0.0, weights).sum(-1, keepdim=True)
+    return order.gather(-1, packed), there, before, skipped.sum(-1, keepdim=True), mass
 
 
 # On a CPU ------------------------------------------------------------------------------------------------------------

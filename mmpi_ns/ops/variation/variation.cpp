@@ -64,33 +64,6 @@ void add_difference(Lanes center, Lanes other, float scale, Lanes& slope, Lanes&
     value += scale * clamped * (difference - 0.5f * clamped);
 }
 
-// Lanes are rows.
-Lanes vary_single(const Table& table, const Group& group, const float* scale, float* grad) {
-    float numbers[7][WIDTH] = {};
-    for (int64_t i = 0; i < group.size; i++)
-        for (int k = 0; k < 7; k++) numbers[k][i] = table.numbers[group.rows[i][k]];
-    Lanes slope{}, value{};
-    for (int k = 0; k < 6; k++) add_difference(load(numbers[0]), load(numbers[k + 1]), scale[k / 2], slope, value);
-    store(grad, slope);
-    return value;
-}
-
-// Lanes are the eight channels of two rows.
-Lanes vary_octets(const Table& table, const Group& group, const float* scale, float* grad) {
-    Lanes total{};
-    for (int64_t i = 0; i < group.size; i += 2) {
-        const bool alone = i + 1 == group.size;
-        const int64_t *row = group.rows[i], *other = group.rows[alone ? i : i + 1];
-        Lanes slope{}, value{};
-        const Lanes center = join(table.octet(row[0]), table.octet(other[0]));
-        for (int k = 1; k < 7; k++)
-            add_difference(center, join(table.octet(row[k]), table.octet(other[k])), scale[(k - 1) / 2], slope, value);
-        store(grad + i * OCTET, slope);
-        total += IOTA < float(alone ? OCTET : WIDTH) ? value : Lanes{};
-    }
-    return total;
-}
-
 // Lanes are channels, sixteen at a time. `grad` has room for sixteen numbers more than it takes.
 Lanes vary(const Table& table, const Group& group, const float* scale, float* grad) {
     Lanes total{};
@@ -149,8 +122,7 @@ void mmpi_total_variation(int64_t begin, int64_t end, const int64_t* rows, int64
             }
             const float each[3] = {scales[3 * group.head] / 6, scales[3 * group.head + 1] / 6,
                                    scales[3 * group.head + 2] / 6};
-            const auto differences = channels == 1 ? vary_single : channels == OCTET ? vary_octets : vary;
-            const Lanes value = differences(table, group, each, scratch.data());
+            const Lanes value = vary(table, group, each, scratch.data());
             std::copy(scratch.data(), scratch.data() + group.size * channels, to);
             for (int i = 0; i < WIDTH; i++) total += value[i];
         }
