@@ -29,7 +29,7 @@ FIRST_PARTS = """(async () => {
     window.whole = new Map(mmpi.windows);
     for (const w of mmpi.windows.keys()) {
         const row = mmpi.header.windows[w];
-        mmpi.windows.set(w, await WindowOnCard.load(mmpi.gl, row, await mmpi.source(row, () => {})[0]));
+        mmpi.windows.set(w, await WindowOnCard.load(mmpi.gl, row, await mmpi.source(row, () => {})[0], mmpi.details));
     }
 })()"""
 """Shows what the page shows before the rest of the windows has come."""

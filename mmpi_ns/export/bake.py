@@ -18,12 +18,13 @@ from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.export.details import StoredView, stored_view
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
-from mmpi_ns.rendering.images import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.parallel import in_order
 
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
@@ -43,19 +44,20 @@ def read_run_config(path: Path) -> MMPIModelConfig:
     return config.pipeline.model
 
 
-def load_model(load_config: Path) -> Any:
-    """The pipeline of a finished run, ready to render its field alone, exactly. Raises InputError as
-    ``read_run_config``."""
+def load_model(load_config: Path, details: bool = False) -> Any:
+    """The pipeline of a finished run, ready to render exactly: with details of its training images, or its field alone.
+    Raises InputError as ``read_run_config``."""
     read_run_config(load_config)
     _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
     assert isinstance(pipeline.model, MMPIModel)
     pipeline.model.config.rendering.mode = "exact"  # the exact renderer is the reference
-    pipeline.model.details = None
+    if not details:
+        pipeline.model.details = None
     return pipeline
 
 
 def bake_run(pipeline: Any, least: float) -> BakedScene:
-    """All windows of a finished run, baked.
+    """All windows of a finished run, baked, and the details that its model has.
 
     Args:
         pipeline: of the run.
@@ -91,7 +93,17 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
     path = poses_of(pipeline)
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
     name = Path(pipeline.datamanager.get_datapath()).resolve().name
-    return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows)
+    return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows, *_details_of(model))
+
+
+def _details_of(model: MMPIModel) -> tuple[tuple[StoredView, ...], int]:
+    """Details of a model, as they are written, and the number of training images for each image."""
+    if model.details is None:
+        return (), 0
+    read, numbers = model.details.view, range(len(model.details.cameras))
+    views = tuple(in_order(lambda i: stored_view(read(i, torch.device("cpu"))), numbers))
+    print(f"Details of {len(views)} training images: {sum(len(v.difference + v.inverse) for v in views) / 1e6:.2f} MB.")
+    return views, model.config.rendering.nearest_images
 
 
 def poses_of(pipeline: Any) -> list[Pose]:
@@ -141,9 +153,7 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
         bundle, truth = image_rays(dataset.cameras[i : i + 1]), dataset[i]["image"][..., :3]
         renderers = {
             "exact": lambda bundle=bundle: pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"],
-            "baked": lambda bundle=bundle: render_in_chunks(
-                bundle, CPU_RAYS, torch.device("cpu"), lambda rays: scene.render(rays.origins, rays.directions)
-            )["rgb"],
+            "baked": lambda bundle=bundle: scene.image(bundle)["rgb"],
         }
         images = {}
         for name, render in renderers.items():

@@ -54,7 +54,7 @@ class _Run:
         # Slow imports, not needed for --help and errors.
         from mmpi_ns.export.bake import bake_run, compare, load_model
 
-        pipeline = load_model(self.load_config)
+        pipeline = load_model(self.load_config, details=True)
         scene = bake_run(pipeline, self.least)
         if self.compare > 0:
             print(compare(pipeline, scene, self.compare))
