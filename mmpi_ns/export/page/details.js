@@ -88,7 +88,6 @@ class Details {
 
   // Uniforms and textures of a picture, for the program in use; none where it shows the field alone.
   bind(uniform, unit, camera) {
-    if (!this.nearest) return;
     const { gl } = this, shown = camera ? this.chosen(camera).filter(({ view }) => this.layers.includes(view)) : [];
     const four = (name, f) => { if (shown.length) gl.uniform4fv(uniform(name), shown.flatMap(f)); };
     gl.uniform1i(uniform("seen"), shown.length);

@@ -200,6 +200,8 @@ class WindowOnCard {
     if (network.size * 16 > gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE))
       throw new Refusal("The network of this scene is too wide for this graphics card.");
     card.groups = Math.ceil(channels.length / 4);
+    const uniforms = 8 * (card.heads + details.nearest) + 32; // vectors, at most
+    card.detailed = details.nearest > 0 && uniforms <= gl.getParameter(gl.MAX_FRAGMENT_UNIFORM_VECTORS);
     card.program = card.compile(network.source);
     card.earlyMasks = await unpack(bytes, arrays.early_columns);
     card.early = await unpack(bytes, arrays.early);
@@ -250,8 +252,8 @@ class WindowOnCard {
       `sums[${g}] += weight / (1.0 + exp(-(low[${g}] + step_[${g}] * textureLod(texels[${g}], uv, 0.0))));`);
     const fragment = "#version 300 es\n" + MARCH
       .replace("NETWORK", network)
-      .replace("ADD_DETAILS", this.details.nearest ? "color = detailed(color, direction, surface);" : "")
-      .replace("DETAILS", this.details.nearest ? DETAILS : "")
+      .replace("ADD_DETAILS", this.detailed ? "color = detailed(color, direction, surface);" : "")
+      .replace("DETAILS", this.detailed ? DETAILS : "")
       .replace("GATHER", gather.join("\n"))
       .replace(/\/\*each\*\/([\s\S]*?)\/\*end\*\//g, (_, body) =>
         Array.from({ length: this.heads }, (_, k) => body.replaceAll("K_", k)).join("\n"))
@@ -350,7 +352,7 @@ class WindowOnCard {
     gl.uniform1i(this.uniform("mode"), view.mode);
     gl.uniform1i(this.uniform("alone"), view.alone);
     gl.uniform1f(this.uniform("share"), share);
-    this.details.bind((name) => this.uniform(name), this.textures.length, view.detailed);
+    if (this.detailed) this.details.bind((name) => this.uniform(name), this.textures.length, view.detailed);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
