@@ -19,7 +19,7 @@ STEP = 1 / 381
 """Of codes of differences: two thirds of a grey level."""
 ZERO = 128
 """Code of no difference."""
-QUALITY = 85
+QUALITY = 80
 """Of differences as WebP."""
 COARSE = 4
 """Rows and columns of an image for each of its depths."""
