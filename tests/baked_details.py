@@ -15,7 +15,7 @@ from mmpi_ns.export.files import BakedScene
 from mmpi_ns.rendering.details import Details, read_details, write_details
 
 HEIGHT, WIDTH = 36, 52
-LENSES = [[0.0] * 6, [0.08, -0.02, 0.004, 0.0, 0.003, -0.002], [0.02, 0.0, 0.0, 0.0, 0.0, 0.0]]
+LENSES = [[0.0] * 6, [0.2, -0.06, 0.02, 0.01, 0.03, -0.02], [0.05, -0.02, 0.0, 0.0, 0.0, 0.0]]
 KINDS = [CameraType.PERSPECTIVE, CameraType.PERSPECTIVE, CameraType.FISHEYE]
 
 
@@ -27,7 +27,7 @@ def opaque_window(seed: int = 0):
 def training_cameras(scene: BakedScene) -> Cameras:
     pose = torch.tensor(scene.path[0].to_world)
     poses = pose.repeat(3, 1, 1)
-    for i, (x, y) in enumerate([(0.01, 0.0), (-0.015, 0.01), (0.0, -0.02)]):
+    for i, (x, y) in enumerate([(0.03, 0.0), (-0.05, 0.03), (0.02, -0.05)]):
         poses[i, :, 3] += x * pose[:, 0] + y * pose[:, 1]
     kinds = torch.tensor([kind.value for kind in KINDS])
     return Cameras(poses, 38.0, 41.0, 25.5, 18.5, WIDTH, HEIGHT, torch.tensor(LENSES), camera_type=kinds)
@@ -35,7 +35,7 @@ def training_cameras(scene: BakedScene) -> Cameras:
 
 def details_for(scene: BakedScene, folder: Path) -> Details:
     """Smooth differences of three training images at the scene's surfaces; the left of the second one is masked."""
-    y, x = np.mgrid[:HEIGHT, :WIDTH] / 6.0
+    y, x = np.mgrid[:HEIGHT, :WIDTH] / 3.0
 
     def image_of(i):
         waves = np.stack([np.sin(x + i), np.cos(y + 2 * i), np.sin(x + y)], -1)
@@ -51,11 +51,11 @@ def details_for(scene: BakedScene, folder: Path) -> Details:
     return read_details(folder)[1]
 
 
-def with_details(scene: BakedScene, folder: Path, nearest: int = 2) -> BakedScene:
+def with_details(scene: BakedScene, folder: Path, nearest: int = 3) -> BakedScene:
     details = details_for(scene, folder)
     views = tuple(stored_view(details.view(i, torch.device("cpu"))) for i in range(3))
     return replace(scene, views=views, nearest=nearest)
 
 
-def detailed_scene(folder: Path, nearest: int = 2) -> BakedScene:
+def detailed_scene(folder: Path, nearest: int = 3) -> BakedScene:
     return with_details(scene_of(opaque_window()), folder, nearest)

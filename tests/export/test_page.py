@@ -287,7 +287,7 @@ def detailed_image(site, number):
 
 
 def test_details_are_those_of_baked_scenes(tab, detailed):
-    """Of a pinhole, a camera with a lens and a fisheye, two of them nearest, one masked in part; depth shows none."""
+    """Of a pinhole, a camera with a lens, masked in part, and a fisheye; one MPI alone has none."""
     with served(detailed) as address:
         assert tab.open(f"{address}/index.html") == "ready"
         for number in (0, 1):

