@@ -37,7 +37,7 @@ FIRST_PARTS = """(async () => {
 """Shows what the page shows before the rest of the windows has come."""
 
 
-def main(load_config: Path, cameras: int = 5, least: float = 0.01) -> None:
+def main(load_config: Path, cameras: int = 5, least: float = 0.003) -> None:
     """Compares.
 
     Args:

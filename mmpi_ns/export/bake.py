@@ -26,6 +26,10 @@ from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order
 
+BRICK_BYTES = 120
+"""Of a brick that is seen little, as written."""
+HARDLY = 0.01
+"""Largest weight of a brick that is left out to make room for details."""
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
 
@@ -61,7 +65,8 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
 
     Args:
         pipeline: of the run.
-        least: bricks in which no training view sees this weight are left out; 0 keeps all.
+        least: bricks in which no training view sees this weight are left out; 0 keeps all. Otherwise those that are
+            seen least make room for details.
 
     Raises:
         ValueError: the model cannot be baked (says why).
@@ -77,23 +82,35 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         rays = image_rays(cameras[i : i + 1], step).flatten()
         return rays.origins.contiguous(), rays.directions.contiguous()
 
+    views, nearest = _details_of(model)
+    room = sum(len(v.difference + v.inverse) for v in views) / BRICK_BYTES / len(places)
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
         whole = model.baked(field)
-        views = (shares[:, number] > 0).nonzero()[:, 0].tolist()
-        step = math.ceil((float((cameras.width * cameras.height)[views].sum()) / MOST_LOOKED_AT) ** 0.5)
-        alike = sorted(views, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
+        cameras_here = (shares[:, number] > 0).nonzero()[:, 0].tolist()
+        step = math.ceil((float((cameras.width * cameras.height)[cameras_here].sum()) / MOST_LOOKED_AT) ** 0.5)
+        alike = sorted(cameras_here, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
         peaks = whole.peaks(alike, partial(rays_of, step))
-        kept = replace(whole, seen=peaks.sum((1, 2))).keep(peaks.amax((1, 2)) >= least)
+        most = peaks.amax((1, 2))
+        limit = _limit(most, least, int(room))
+        kept = replace(whole, seen=peaks.sum((1, 2))).keep(most >= limit)
         print(
-            f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({least:g} or more)."
+            f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({limit:.3g} or more)."
         )
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
     path = poses_of(pipeline)
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
     name = Path(pipeline.datamanager.get_datapath()).resolve().name
-    return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows, *_details_of(model))
+    return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows, views, nearest)
+
+
+def _limit(peaks: Tensor, least: float, bricks: int) -> float:
+    """The weight below which bricks are left out: ``least``, or more if so many others make room, up to ``HARDLY``."""
+    seen = peaks[peaks >= least].sort().values
+    if least == 0 or not bricks or not len(seen):
+        return least
+    return max(least, min(HARDLY, float(seen[min(bricks, len(seen) - 1)])))
 
 
 def _details_of(model: MMPIModel) -> tuple[tuple[StoredView, ...], int]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class _Run:
     load_config: Path
     """config.yml of a finished run."""
-    least: float = 0.01
+    least: float = 0.003
     """Bricks in which no training view sees this rendering weight are left out; 0 keeps all."""
     compare: int = 5
     """Test images to compare with the exact renderer; 0 for none."""
