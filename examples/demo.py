@@ -187,7 +187,7 @@ class Demo:
         if not self._is_newer(self.page):
             self._command(
                 "mmpi-export", "web", "--load-config", str(self.run / "config.yml"), "--output", str(self.page),
-                "--single-file", "--overwrite", "--compare", "0", "--least", "0.009",
+                "--single-file", "--overwrite", "--compare", "0",
             )  # fmt: skip
 
     def _say_where(self, results: dict[str, Any], film: Path, seconds: float) -> None:

@@ -18,7 +18,6 @@ from torch import Tensor
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.export.bake import read_run_config
 from mmpi_ns.export.files import HEADER, BakedScene, read_baked
-from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
 from mmpi_ns.utils.errors import InputError
@@ -114,10 +113,7 @@ def _load_baked(baked: BakedScene, device: torch.device) -> Scene:
     def render_image(camera: Cameras) -> dict[str, Tensor]:
         rays = PinholeRays.of(camera, "cpu")
         assert rays is not None
-        bundle = rays.image(int(camera.height), int(camera.width))
-        return render_in_chunks(
-            bundle, SHOWN_RAYS, bundle.origins.device, lambda part: baked.render(part.origins, part.directions)
-        )
+        return baked.image(rays.image(int(camera.height), int(camera.width)))
 
     numbers = torch.tensor([(*pose.focal, *pose.center) for pose in baked.path])
     poses, sizes = torch.tensor([pose.to_world for pose in baked.path]), torch.tensor([p.size for p in baked.path])

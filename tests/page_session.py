@@ -25,11 +25,13 @@ from mmpi_ns.rendering.metrics import ImageMetrics
 
 LEAST_DB, MOST_LOST = 38.0, 0.1
 WHOLE = "[...mmpi.windows.values()].every((w) => w && w.whole)"
+DETAILED = "(!mmpi.details.nearest || mmpi.details.views.length > 0 && mmpi.details.ready(mmpi.camera))"
 FIRST_PARTS = """(async () => {
     window.whole = new Map(mmpi.windows);
+    window.views = mmpi.details.views.splice(0);
     for (const w of mmpi.windows.keys()) {
         const row = mmpi.header.windows[w];
-        mmpi.windows.set(w, await WindowOnCard.load(mmpi.gl, row, await mmpi.source(row, () => {})[0]));
+        mmpi.windows.set(w, await WindowOnCard.load(mmpi.gl, row, await mmpi.source(row, () => {})[0], mmpi.details));
     }
 })()"""
 """Shows what the page shows before the rest of the windows has come."""
@@ -43,7 +45,7 @@ def main(load_config: Path, cameras: int = 5, least: float = 0.003) -> None:
         cameras: test cameras, evenly spaced.
         least: bricks in which no training view sees this weight are left out.
     """
-    pipeline = load_model(load_config)
+    pipeline = load_model(load_config, details=True)
     train, test = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
     places = sorted(str(name) for dataset in (train, test) for name in dataset.image_filenames)
     metrics, close, lost, early = ImageMetrics("none"), [], [], []
@@ -61,13 +63,15 @@ def main(load_config: Path, cameras: int = 5, least: float = 0.003) -> None:
             print(f"all there after {time.perf_counter() - start:.1f} s")
             for i in np.linspace(0, len(test) - 1, cameras).astype(int).tolist():
                 camera = f"mmpi.path[{places.index(str(test.image_filenames[i]))}]"
-                tab.evaluate(f"mmpi.camera = structuredClone({camera}); mmpi.feed()")
-                tab.until(WHOLE, 120)
+                tab.evaluate(
+                    f"mmpi.camera = structuredClone({camera}); mmpi.touched()"
+                )  # its frames fetch what it needs
+                tab.until(f"{WHOLE} && {DETAILED}", 120)
                 draw = f"(mmpi.draw({camera}, ...{camera}.size), mmpi.gl.canvas.toDataURL())"
                 shown = tab.picture(draw)
                 tab.evaluate(FIRST_PARTS)
                 first = torch.from_numpy(tab.picture(draw)).float()
-                tab.evaluate("mmpi.windows.forEach((w) => w.free()); mmpi.windows = whole")
+                tab.evaluate("mmpi.windows.forEach((w) => w.free()); mmpi.windows = whole; mmpi.details.views = views")
                 exact = pipeline.model.get_outputs_for_camera(test.cameras[i : i + 1])["rgb"].cpu()
                 canvas, truth = torch.from_numpy(shown).float(), test[i]["image"][..., :3]
                 close.append(metrics(canvas, exact)["psnr"])

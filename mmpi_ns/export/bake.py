@@ -18,13 +18,20 @@ from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.export.details import StoredView, stored_view
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
-from mmpi_ns.rendering.images import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.parallel import in_order
 
+BRICK_BYTES = 60
+"""Of a brick that is seen little, as written: 80 on kitti-street, 96 on fox, and some less so that there is room."""
+VIEW_BYTES = 1000
+"""Of a training image beside its details: its row in the header, and its share of the page's program."""
+HARDLY = 0.01
+"""Largest weight of a brick that is left out to make room for details."""
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
 
@@ -43,23 +50,25 @@ def read_run_config(path: Path) -> MMPIModelConfig:
     return config.pipeline.model
 
 
-def load_model(load_config: Path) -> Any:
-    """The pipeline of a finished run, ready to render its field alone, exactly. Raises InputError as
-    ``read_run_config``."""
+def load_model(load_config: Path, details: bool = False) -> Any:
+    """The pipeline of a finished run, ready to render exactly: with details of its training images, or its field alone.
+    Raises InputError as ``read_run_config``."""
     read_run_config(load_config)
     _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
     assert isinstance(pipeline.model, MMPIModel)
     pipeline.model.config.rendering.mode = "exact"  # the exact renderer is the reference
-    pipeline.model.details = None
+    if not details:
+        pipeline.model.details = None
     return pipeline
 
 
 def bake_run(pipeline: Any, least: float) -> BakedScene:
-    """All windows of a finished run, baked.
+    """All windows of a finished run, baked, and the details that its model has.
 
     Args:
         pipeline: of the run.
-        least: bricks in which no training view sees this weight are left out; 0 keeps all.
+        least: bricks in which no training view sees this weight are left out; 0 keeps all. Otherwise those that are
+            seen least make room for details.
 
     Raises:
         ValueError: the model cannot be baked (says why).
@@ -75,23 +84,45 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         rays = image_rays(cameras[i : i + 1], step).flatten()
         return rays.origins.contiguous(), rays.directions.contiguous()
 
+    views, nearest = _details_of(model)
+    room = sum(len(v.difference + v.inverse) + VIEW_BYTES for v in views) / BRICK_BYTES / len(places)
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
         whole = model.baked(field)
-        views = (shares[:, number] > 0).nonzero()[:, 0].tolist()
-        step = math.ceil((float((cameras.width * cameras.height)[views].sum()) / MOST_LOOKED_AT) ** 0.5)
-        alike = sorted(views, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
+        cameras_here = (shares[:, number] > 0).nonzero()[:, 0].tolist()
+        step = math.ceil((float((cameras.width * cameras.height)[cameras_here].sum()) / MOST_LOOKED_AT) ** 0.5)
+        alike = sorted(cameras_here, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
         peaks = whole.peaks(alike, partial(rays_of, step))
-        kept = replace(whole, seen=peaks.sum((1, 2))).keep(peaks.amax((1, 2)) >= least)
+        most = peaks.amax((1, 2))
+        limit = _limit(most, least, int(room))
+        kept = replace(whole, seen=peaks.sum((1, 2))).keep(most >= limit)
         print(
-            f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({least:g} or more)."
+            f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({limit:.3g} or more)."
         )
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
     path = poses_of(pipeline)
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
     name = Path(pipeline.datamanager.get_datapath()).resolve().name
-    return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows)
+    return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows, views, nearest)
+
+
+def _limit(peaks: Tensor, least: float, bricks: int) -> float:
+    """The weight below which bricks are left out: ``least``, or more if so many others make room, up to ``HARDLY``."""
+    seen = peaks[peaks >= least].sort().values
+    if least == 0 or not bricks or not len(seen):
+        return least
+    return max(least, min(HARDLY, float(seen[min(bricks, len(seen) - 1)])))
+
+
+def _details_of(model: MMPIModel) -> tuple[tuple[StoredView, ...], int]:
+    """Details of a model, as they are written, and the number of training images for each image."""
+    if model.details is None:
+        return (), 0
+    read, numbers = model.details.view, range(len(model.details.cameras))
+    views = tuple(in_order(lambda i: stored_view(read(i, torch.device("cpu"))), numbers))
+    print(f"Details of {len(views)} training images: {sum(len(v.difference + v.inverse) for v in views) / 1e6:.2f} MB.")
+    return views, model.config.rendering.nearest_images
 
 
 def poses_of(pipeline: Any) -> list[Pose]:
@@ -141,9 +172,7 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
         bundle, truth = image_rays(dataset.cameras[i : i + 1]), dataset[i]["image"][..., :3]
         renderers = {
             "exact": lambda bundle=bundle: pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"],
-            "baked": lambda bundle=bundle: render_in_chunks(
-                bundle, CPU_RAYS, torch.device("cpu"), lambda rays: scene.render(rays.origins, rays.directions)
-            )["rgb"],
+            "baked": lambda bundle=bundle: scene.image(bundle)["rgb"],
         }
         images = {}
         for name, render in renderers.items():

@@ -12,18 +12,22 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
+from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.export.details import STEP, StoredView, cameras_of, restored_details
 from mmpi_ns.rendering.baked import BakedWindow
-from mmpi_ns.rendering.images import render_windows
+from mmpi_ns.rendering.details import Details
+from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks, render_windows
 from mmpi_ns.scene.baked import (
     CELLS,
     SIDE,
@@ -36,12 +40,12 @@ from mmpi_ns.scene.baked import (
     take_borders,
 )
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
-from mmpi_ns.scene.windows import Window
+from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order
 
-FORMAT, VERSION = "mmpi-baked", 3
+FORMAT, VERSION = "mmpi-baked", 4
 HEADER = "scene.json"
 BLOCK = 1 << 20
 """Bytes that one thread compresses at a time."""
@@ -50,6 +54,7 @@ EARLY = 0.2
 COARSE = np.zeros((SIDE, SIDE), bool)
 """Texels that are stored first."""
 COARSE[::2, ::2] = True
+PARTS_OF_VIEW = ("difference", "inverse")
 
 
 @dataclass(frozen=True)
@@ -83,9 +88,27 @@ class BakedScene:
     path: list[Pose]
     windows: list[tuple[Window, BakedWindow]]
     """The region of a window (its plan contains the MPIs as baked), and its content."""
+    views: tuple[StoredView, ...] = ()
+    """Details of the training images (docs/details.md)."""
+    nearest: int = 0
+    """Number of training images that an image takes details from."""
+
+    @cached_property
+    def details(self) -> Details:
+        return restored_details(self.views)
+
+    def image(self, bundle: RayBundle) -> dict[str, Tensor]:
+        """Outputs of an image's rays [H, W], as of the model: with details, where there are some."""
+        device = bundle.origins.device
+        outputs = render_in_chunks(bundle, SHOWN_RAYS, device, lambda rays: self.render(rays.origins, rays.directions))
+        if not self.views:
+            return outputs
+        exposure = outputs["rgb"].new_tensor(self.windows[0][1].exposure)
+        return self.details.added(outputs, bundle, self.nearest, exposure)
 
     def render(self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> dict[str, Tensor]:
-        """Outputs of rays, as ``BakedWindow.render``, from the windows that they start in, mixed as in the model."""
+        """The field's outputs for rays, as ``BakedWindow.render``, of the windows that they start in, mixed as in the
+        model."""
         places, windows = zip(*self.windows, strict=True)
         if len(windows) == 1:
             return windows[0].render(origins, directions)
@@ -103,13 +126,17 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / HEADER).unlink(missing_ok=True)
-    rows = [_write_window(folder / f"window-{i:05d}.bin", *window) for i, window in enumerate(scene.windows)]
+    rows = [
+        _write_window(folder / f"window-{i:05d}.bin", *window, views)
+        for i, (window, views) in enumerate(zip(scene.windows, _views_of_windows(scene), strict=True))
+    ]
     header = {
         "format": FORMAT,
         "version": VERSION,
         "name": scene.name,
         "up": scene.up,
         "path": [pose.__dict__ for pose in scene.path],
+        "details": {"nearest": scene.nearest, "step": STEP} if scene.views else None,
         "windows": rows,
     }
     text = json.dumps(header, allow_nan=False)
@@ -117,8 +144,20 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
     return sum(row["bytes"] for row in rows) + len(text)
 
 
-def _write_window(file: Path, place: Window, window: BakedWindow) -> dict[str, Any]:
-    """Writes a window's arrays one after the other, each compressed; returns the window's part of the header."""
+def _views_of_windows(scene: BakedScene) -> list[list[StoredView]]:
+    """Details of the training images that stand nearest to each window."""
+    places = tuple(place for place, _ in scene.windows)
+    views: list[list[StoredView]] = [[] for _ in places]
+    if scene.views:
+        largest = window_shares(cameras_of(scene.views)[:, [3, 7, 11]], places).argmax(-1).tolist()
+        for view, window in zip(scene.views, largest, strict=True):
+            views[window].append(view)
+    return views
+
+
+def _write_window(file: Path, place: Window, window: BakedWindow, views: list[StoredView]) -> dict[str, Any]:
+    """Writes a window's arrays one after the other, each compressed, and then details; returns the window's part of the
+    header."""
     mpis, shader = window.mpis, window.shader
     seen = torch.zeros(mpis.num_bricks) if window.seen is None else window.seen
     early = torch.zeros(mpis.num_bricks, dtype=torch.bool)
@@ -144,6 +183,13 @@ def _write_window(file: Path, place: Window, window: BakedWindow) -> dict[str, A
         data = _gzip(np.ascontiguousarray(array).tobytes())
         places[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
         blob += data
+    bricks_bytes, view_rows = len(blob), []
+    for view in views:
+        row: dict[str, Any] = {"camera": view.camera, "size": view.size, "most": view.most}
+        for name in PARTS_OF_VIEW:
+            row[name] = {"offset": len(blob), "bytes": len(getattr(view, name))}
+            blob += getattr(view, name)
+        view_rows.append(row)
     write_atomically(file, lambda path: path.write_bytes(blob))
     plan = json.loads(place.plan.to_json())
     extra = [{"interval": interval, "first_column": mpis.first_column(k)} for k, interval in enumerate(mpis.intervals)]
@@ -151,6 +197,7 @@ def _write_window(file: Path, place: Window, window: BakedWindow) -> dict[str, A
         "file": file.name,
         "bytes": len(blob),
         "first_bytes": places["columns"]["offset"],
+        "bricks_bytes": bricks_bytes,
         "center": place.center,
         "radius": None if math.isinf(place.radius) else place.radius,
         "margin": place.margin,
@@ -170,6 +217,7 @@ def _write_window(file: Path, place: Window, window: BakedWindow) -> dict[str, A
             "bound": shader.bound,
         },
         "arrays": places,
+        "views": view_rows,
     }
 
 
@@ -194,10 +242,11 @@ def read_baked(folder: Path) -> BakedScene:
     do)."""
     header = read_header(folder)
     try:
-        windows = [_read_window(folder, row) for row in header["windows"]]
+        windows, views = zip(*(_read_window(folder, row) for row in header["windows"]), strict=True)
+        nearest = 0 if header["details"] is None else header["details"]["nearest"]
         vectors = ("size", "focal", "center")
         path = [Pose(p["to_world"], *(tuple(p[v]) for v in vectors), test=p["test"]) for p in header["path"]]
-        return BakedScene(header["name"], tuple(header["up"]), path, windows)
+        return BakedScene(header["name"], tuple(header["up"]), path, list(windows), sum(views, ()), nearest)
     except (KeyError, TypeError, InputError) as error:
         raise ValueError(f"{folder / HEADER} is damaged ({error!r}): bake the scene again.") from error
 
@@ -221,7 +270,7 @@ def read_header(folder: Path) -> dict[str, Any]:
     return header
 
 
-def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow]:
+def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, BakedWindow], tuple[StoredView, ...]]:
     path = folder / row["file"]
     blob = path.read_bytes() if path.is_file() else b""
     if len(blob) != row["bytes"]:
@@ -229,10 +278,13 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow
             f"{path} is cut short or missing ({len(blob)} of {row['bytes']} bytes): copy it anew, or bake again."
         )
 
+    def part(spec: dict[str, int]) -> bytes:
+        return blob[spec["offset"] : spec["offset"] + spec["bytes"]]
+
     def array(name: str) -> NDArray[Any]:
         spec = row["arrays"][name]
         try:
-            data = gzip.decompress(blob[spec["offset"] : spec["offset"] + spec["bytes"]])
+            data = gzip.decompress(part(spec))
             return np.frombuffer(data, spec["type"]).reshape(spec["shape"]).copy()
         except (OSError, EOFError, ValueError) as error:
             raise ValueError(
@@ -272,7 +324,11 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow
     exposure = tuple(row.get("exposure", (1.0, 1.0, 1.0)))  # before images were shown at one exposure
     near, far = row["ray_near"], row["farthest"]
     window = BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure, early.float())
-    return Window(tuple(row["center"]), radius, row["margin"], plan), window
+    views = tuple(
+        StoredView(tuple(view["camera"]), tuple(view["size"]), view["most"], *(part(view[x]) for x in PARTS_OF_VIEW))
+        for view in row["views"]
+    )
+    return (Window(tuple(row["center"]), radius, row["margin"], plan), window), views
 
 
 def split_codes(

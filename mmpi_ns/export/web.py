@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import base64
+from itertools import pairwise
 from pathlib import Path
 
 from mmpi_ns.export.files import HEADER, read_header
 from mmpi_ns.ops import ends
+from mmpi_ns.ops.details import TEXT as WEIGHTS
+from mmpi_ns.rendering.details import MAX_ANGLE
 from mmpi_ns.utils.files import write_atomically
 
 PAGE = Path(__file__).parent / "page"
@@ -35,19 +38,24 @@ def write_single_file(folder: Path, path: Path) -> None:
     header = read_header(folder)
     block = '<script type="{}" id="{}">{}</script>'
     text = (folder / HEADER).read_text(encoding="utf-8").replace("<", "\\u003c")
-    first, rest = [block.format("application/json", HEADER, text)], []
+    first, rest, last = [block.format("application/json", HEADER, text)], [], []
     for row in header["windows"]:
         data, kind = (folder / row["file"]).read_bytes(), "application/octet-stream"
-        parts = [base64.b64encode(part).decode() for part in (data[: row["first_bytes"]], data[row["first_bytes"] :])]
+        ends_of_parts = (0, row["first_bytes"], row["bricks_bytes"], row["bytes"])
+        parts = [base64.b64encode(data[begin:end]).decode() for begin, end in pairwise(ends_of_parts)]
         first.append(block.format(kind, row["file"], parts[0]))
         rest.append(block.format(kind, f"{row['file']}.rest", parts[1]))
-    html = _html("\n".join(first), "\n".join(rest))  # the code between them runs before the rest is there
+        last.append(block.format(kind, f"{row['file']}.details", parts[2]))
+    html = _html("\n".join(first), "\n".join(rest + last))  # the code between them runs before the rest is there
     write_atomically(path, lambda unfinished: unfinished.write_text(html, encoding="utf-8"))
 
 
 def _html(first: str, rest: str) -> str:
-    shader = (PAGE / "march.glsl").read_text(encoding="utf-8").replace("ENDS", ends.TEXT, 1)
-    code = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in ("scene.js", "page.js"))
-    page = (PAGE / "index.html").read_text(encoding="utf-8")
-    page = page.replace("/*code*/", f"const MARCH = `{shader}`;\n{code}")
+    march, details, page, *scripts = (
+        (PAGE / name).read_text(encoding="utf-8")
+        for name in ("march.glsl", "details.glsl", "index.html", "scene.js", "details.js", "page.js")
+    )
+    shaders = {"MARCH": march.replace("ENDS", ends.TEXT, 1), "DETAILS": WEIGHTS + details}
+    constants = [f"const {name} = `{text}`;" for name, text in shaders.items()] + [f"const MAX_ANGLE = {MAX_ANGLE};"]
+    page = page.replace("/*code*/", "\n".join([*constants, *scripts]))
     return page.replace("<!--data-->", first).replace("<!--rest-->", rest)

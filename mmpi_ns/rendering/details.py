@@ -29,17 +29,13 @@ from rich.progress import track
 from torch import Tensor
 
 from mmpi_ns.capture.rays import image_rays
-from mmpi_ns.ops.details import seen_details
+from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH, seen_details
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, brief, say
 from mmpi_ns.utils.files import write_atomically
 
-STRENGTH = 0.9
-"""Share of a difference that is shown: the rest does not recur in other views."""
 MAX_ANGLE = 45.0
 """Between the viewing directions of an image and of the training images that it takes details from, degrees."""
-LEAST = 0.1
-"""Total weight of training images below which details fade."""
 LARGEST = 0.5
 """Largest difference that is kept, of colours in [0, 1]."""
 LEVELS = 127
@@ -79,7 +75,7 @@ def blended_details(
         directions: of the rays, unit length.
         depth: distances of their surfaces along the rays; infinity is allowed.
     """
-    total, weight, inverse = torch.zeros_like(origins), torch.full_like(depth, LEAST), 1 / depth
+    total, weight, inverse = torch.zeros_like(origins), torch.full_like(depth, LEAST_WEIGHT), 1 / depth
     for view, share in zip(views, shares, strict=True):
         difference, seen = seen_details(origins, directions, inverse, view.image, view.camera)
         total += share * seen * difference
@@ -88,31 +84,17 @@ def blended_details(
 
 
 class Details:
-    """The details of a run, read from its folder as images need them.
+    """Training images with what the field lacks in them, read as images need them.
 
     Args:
-        folder: that ``write_details`` has filled.
+        cameras: of the training images, as ``ops.details.seen_details`` takes them. [N, 24]
+        read: a training image by its number, on a device.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        try:
-            with np.load(folder / CAMERAS_FILE) as file:
-                self.step, self.cameras = int(file["step"]), torch.from_numpy(file["cameras"])
-        except DAMAGED as error:
-            raise _damaged(folder / CAMERAS_FILE, error) from error
-        self._poses = self.cameras[:, :12].view(-1, 3, 4).double().numpy()
-        self.view = lru_cache(maxsize=8)(self._read)
-
-    def _read(self, i: int, device: torch.device) -> DetailView:
-        path = self.folder / f"{i:05d}.npz"
-        try:
-            with np.load(path) as file:
-                difference, inverse = (torch.from_numpy(file[name]).to(device) for name in ("difference", "inverse"))
-        except DAMAGED as error:
-            raise _damaged(path, error) from error
-        image = torch.cat([difference.float() * (LARGEST / LEVELS), inverse.float()[..., None]], -1)
-        return DetailView(image, self.cameras[i].to(device))
+    def __init__(self, cameras: Float[Tensor, "N 24"], read: Callable[[int, torch.device], DetailView]) -> None:
+        self.cameras = cameras
+        self._poses = cameras[:, :12].view(-1, 3, 4).double().numpy()
+        self.view = lru_cache(maxsize=8)(read)
 
     def added(
         self, outputs: dict[str, Tensor], bundle: RayBundle, nearest: int, exposure: Float[Tensor, "3"] | None
@@ -156,6 +138,27 @@ class Details:
         return torch.cat([blended_details(views, shares, *part) for part in rays]).view(bundle.origins.shape)
 
 
+def read_details(folder: Path) -> tuple[int, Details]:
+    """What ``write_details`` has written, and the step of its checkpoint. Raises InputError if it is damaged."""
+    try:
+        with np.load(folder / CAMERAS_FILE) as file:
+            step, cameras = int(file["step"]), torch.from_numpy(file["cameras"])
+    except DAMAGED as error:
+        raise _damaged(folder / CAMERAS_FILE, error) from error
+
+    def read(i: int, device: torch.device) -> DetailView:
+        path = folder / f"{i:05d}.npz"
+        try:
+            with np.load(path) as file:
+                difference, inverse = (torch.from_numpy(file[name]).to(device) for name in ("difference", "inverse"))
+        except DAMAGED as error:
+            raise _damaged(path, error) from error
+        image = torch.cat([difference.float() * (LARGEST / LEVELS), inverse.float()[..., None]], -1)
+        return DetailView(image, cameras[i].to(device))
+
+    return step, Details(cameras, read)
+
+
 def _damaged(path: Path, error: Exception) -> InputError:
     return InputError(
         f"{path} is damaged ({brief(error)}): remove the folder {path.parent}, and images show the field alone, or "
@@ -166,8 +169,8 @@ def _damaged(path: Path, error: Exception) -> InputError:
 def details_of(folder: Path | None, step: int) -> Details | None:
     """The details of a run that belong to its checkpoint of a step; None, with a sentence, if it has none."""
     if folder is not None and (folder / CAMERAS_FILE).is_file():
-        details = Details(folder)
-        if details.step == step:
+        kept_at, details = read_details(folder)
+        if kept_at == step:
             return details
     say("This checkpoint has no details of the training images (they are made after the last step): images show the "
         "field alone.")  # fmt: skip

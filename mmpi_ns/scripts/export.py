@@ -48,13 +48,13 @@ class _Run:
             if not self.overwrite:
                 raise ValueError(f"{output} holds an export already: name another folder, or give --overwrite.")
 
-    def bake(self) -> BakedScene:
-        """Bakes the run's scene and prints the loss of quality."""
+    def bake(self, details: bool = True) -> BakedScene:
+        """Bakes the run's scene, with details or its field alone, and prints the loss of quality."""
         check_options(self, {"least": Number(0, 1), "compare": Number(0, whole=True)}, "--")
         # Slow imports, not needed for --help and errors.
         from mmpi_ns.export.bake import bake_run, compare, load_model
 
-        pipeline = load_model(self.load_config)
+        pipeline = load_model(self.load_config, details)
         scene = bake_run(pipeline, self.least)
         if self.compare > 0:
             print(compare(pipeline, scene, self.compare))
@@ -124,7 +124,7 @@ class Splats(_Run):
 
         if dispatch.fault("C++") is not None:
             raise ValueError("Colours of splats are fitted by compiled code: install a C++ compiler (g++ or clang++).")
-        scene = self.bake()
+        scene = self.bake(details=False)  # splats do not show them
         from mmpi_ns.export.splats import poses_in, splats_of, write_ply
 
         for number, (place, window) in enumerate(scene.windows):

@@ -5,15 +5,18 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import shutil
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from baked_details import detailed_scene
 from browser import CHROMIUM, browser, served
 from random_bricks import random_window, scene_of
 
+import mmpi_ns
 from mmpi_ns.export import files
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
 from mmpi_ns.export.web import write_page, write_single_file
@@ -63,6 +66,10 @@ def opened(tab, site):
         yield tab
 
 
+def psnr(a, b):
+    return -10 * np.log10(np.square(a - b).mean())
+
+
 def ours(site, pose):
     scene = read_baked(site)
     origins, directions = camera_rays(pose.__dict__)
@@ -78,8 +85,7 @@ def test_the_canvas_shows_what_we_render(opened, site):
     for number, pose in enumerate(read_baked(site).path):
         a, b = shown(opened, number), ours(site, pose)
         assert b.std() > 0.02  # there is something to see
-        psnr = -10 * np.log10(np.square(a - b).mean())
-        assert psnr > CLOSE, (number, psnr)
+        assert psnr(a, b) > CLOSE, (number, psnr(a, b))
 
 
 def test_windows_are_mixed(opened, site):
@@ -91,9 +97,9 @@ def test_windows_are_mixed(opened, site):
     pose = scene.path[0]
     for row, value in zip(pose.to_world, middle, strict=True):
         row[3] = float(value)
-    psnr = -10 * np.log10(np.square(shown(opened, 0) - ours(site, pose)).mean())
+    close = psnr(shown(opened, 0), ours(site, pose))
     opened.evaluate("mmpi.press('r')")
-    assert psnr > CLOSE - 4  # each window's part is rounded to 8 bits
+    assert close > CLOSE - 4  # each window's part is rounded to 8 bits
 
 
 def until(happened, wait=30):
@@ -226,7 +232,7 @@ DECODED = """(async () => {
     const { addAtlas } = WindowOnCard.prototype;
     const into = (which) => { WindowOnCard.prototype.addAtlas = (codes) => which.push(...codes.map((c) => [...c])); };
     into(shown[0]);
-    const card = await WindowOnCard.load(mmpi.gl, row, await first);
+    const card = await WindowOnCard.load(mmpi.gl, row, await first, mmpi.details);
     into(shown[1]);
     await card.complete(await rest);
     WindowOnCard.prototype.addAtlas = addAtlas;
@@ -264,6 +270,89 @@ def test_the_bricks_that_are_seen_most_come_first_at_half_of_their_resolution(ta
     for codes in expected:
         take_borders(codes, neighbours(kept.columns, kept.mpis, kept.num_bricks))
     assert torch.equal(first, torch.stack(expected).flatten(2).flatten(1))
+
+
+@pytest.fixture(scope="module")
+def detailed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("detailed")
+    write_baked(detailed_scene(folder / "details"), folder / "site")
+    write_page(folder / "site")
+    return folder / "site"
+
+
+def detailed_image(site, number):
+    scene = mmpi_ns.load(site, device="cpu")
+    size = scene.path.sizes[number].tolist()
+    return mmpi_ns.render(scene, scene.path.camera_to_worlds[number], scene.path.intrinsics[number], *size).rgb.numpy()
+
+
+def test_details_are_those_of_baked_scenes(tab, detailed):
+    """Of a pinhole, a camera with a lens, masked in part, and a fisheye; one MPI alone has none."""
+    with served(detailed) as address:
+        assert tab.open(f"{address}/index.html") == "ready"
+        for number in (0, 1):
+            tab.evaluate(f"mmpi.camera = structuredClone(mmpi.path[{number}]); mmpi.touched(); mmpi.feed()")
+            tab.until(f"{WHOLE} && mmpi.details.views.length === 3 && mmpi.details.ready(mmpi.path[{number}])")
+            a, b, field = (
+                shown(tab, number),
+                detailed_image(detailed, number),
+                ours(detailed, read_baked(detailed).path[number]),
+            )
+            assert psnr(a, b) > CLOSE and psnr(field, b) < 28, (number, psnr(a, b), psnr(field, b))
+        tab.evaluate("mmpi.press('m')")
+        assert psnr(shown(tab, 0), ours(detailed, read_baked(detailed).path[0])) > CLOSE  # the only MPI alone
+        tab.evaluate("mmpi.press('m')")
+    assert tab.messages == []
+
+
+def test_the_images_that_a_camera_needs_take_the_place_of_others(tab, tmp_path):
+    """More training images than fit the card: each camera gets its nearest ones, as in baked scenes, less the nearer
+    they are to the next one; and a window that leaves takes its images along."""
+    scene = detailed_scene(tmp_path / "details", nearest=1)
+    views = []
+    for i in range(9):
+        camera = list(scene.views[i % 3].camera)
+        camera[3] += 0.002 * i
+        views.append(replace(scene.views[i % 3], camera=tuple(camera)))
+    write_baked(replace(scene, views=tuple(views)), tmp_path / "site")
+    write_page(tmp_path / "site")
+    with served(tmp_path / "site") as address:
+        assert tab.open(f"{address}/index.html") == "ready"
+        tab.until(f"{WHOLE} && mmpi.details.views.length === 9")
+        details = read_baked(tmp_path / "site").details
+        for i in (0, 5, 8, 2, 7):
+            eye = [x + 1e-4 for x in details.cameras[i, [3, 7, 11]].tolist()]
+            tab.evaluate(f"mmpi.camera.eye = {eye}; mmpi.touched(); mmpi.feed()")
+            tab.until("mmpi.details.ready(mmpi.camera)")
+            kept = tab.evaluate("mmpi.details.layers.filter(Boolean).map((v) => mmpi.details.views.indexOf(v))")
+            assert i in kept and len(kept) <= 3
+            share = tab.evaluate("mmpi.details.chosen(mmpi.camera).map((c) => c.share)")
+            apart = (details.cameras[:, [3, 7, 11]] - torch.tensor(eye)).norm(dim=-1).sort().values
+            assert share == pytest.approx([1 - float(apart[0] / apart[1]) ** 2], abs=1e-3)
+        tab.evaluate("mmpi.details.remove(mmpi.header.windows[0])")
+        assert tab.evaluate("mmpi.details.views.length + mmpi.details.layers.filter(Boolean).length") == 0
+    assert tab.messages == []
+
+
+def test_damaged_details_are_a_sentence_on_the_page(tab, detailed, tmp_path):
+    shutil.copytree(detailed, tmp_path / "site")
+    header = json.loads((tmp_path / "site" / HEADER).read_text())
+    blob = tmp_path / "site" / header["windows"][0]["file"]
+    data = bytearray(blob.read_bytes())
+    for view in header["windows"][0]["views"]:
+        data[view["difference"]["offset"] : view["difference"]["offset"] + 12] = bytes(12)
+    blob.write_bytes(data)
+    with served(tmp_path / "site") as address:
+        tab.open(f"{address}/index.html")
+        tab.until("document.body.dataset.state === 'failed'")
+        assert "damaged" in tab.evaluate("document.getElementById('status').textContent")
+
+
+def test_one_file_shows_details(tab, detailed, tmp_path):
+    write_single_file(detailed, tmp_path / "one.html")
+    assert tab.open((tmp_path / "one.html").as_uri()) == "ready"
+    tab.until(f"{WHOLE} && mmpi.details.ready(mmpi.path[0]) && mmpi.details.views.length === 3")
+    assert psnr(shown(tab, 0), detailed_image(detailed, 0)) > 38
 
 
 def test_one_file_opens_from_the_disk(tab, site, tmp_path):

@@ -4,6 +4,7 @@ precision highp float;
 precision highp int;
 precision highp sampler2D;
 precision highp usampler2D;
+precision highp sampler2DArray;
 
 ENDS
 
@@ -163,10 +164,12 @@ float march(vec3 direction, float expected) {
   return depth;
 }
 
+DETAILS
+
 void main() {
   vec2 at = vec2(gl_FragCoord.x, rows - gl_FragCoord.y);
   vec3 direction = normalize(turn * vec3((at.x - lens.z) / lens.x, -(at.y - lens.w) / lens.y, -1.0));
-  march(direction, 1.0);
+  float surface = march(direction, 1.0);
   vec3 color = vec3(0.0);
   if (mode == 1) { // half of what a ray gathers is known once it has gathered it
     float depth = mass > 0.0 ? march(direction, mass) : -1.0;
@@ -178,6 +181,7 @@ void main() {
   } else {
     if (mass > 0.0) color = exposure * shade(sums, mass, direction) * (1.0 - light);
     color = clamp(color + light * background, 0.0, 1.0);
+    ADD_DETAILS
   }
   pixel = vec4(share * color, share);
 }

@@ -33,6 +33,7 @@ class Page {
     // `alone` is {window, head} of the one MPI to show, or null for all of them.
     this.cost = 1e-5; // seconds a pixel, as the last frame took
     this.keys = new Set();
+    this.details = new Details(gl, header, () => { this.dirty = true; }, (error) => this.fail(error));
     this.windows = new Map(); // on the card, by number, least recently needed first; null while it is on its way
     this.path = header.path.map(cameraOf);
     const training = header.path.findIndex((pose) => !pose.test);
@@ -59,12 +60,13 @@ class Page {
         const told = (part) => {
           if (!this.failed) report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
         };
-        const [first, rest] = this.source(row, told);
+        const [first, rest, views] = this.source(row, told);
         try {
-          const window = await WindowOnCard.load(this.gl, row, await first);
+          const window = await WindowOnCard.load(this.gl, row, await first, this.details);
           this.windows.set(w, window);
           this.dirty = true;
-          rest.then((bytes) => window.complete(bytes)).then(() => { told(1); this.dirty = true; }).catch((e) => this.fail(e));
+          rest.then((bytes) => window.complete(bytes)).then(() => { told(1); this.dirty = true; return views; })
+            .then((bytes) => { if (!window.freed) this.details.add(row, bytes); }).catch((e) => this.fail(e));
         } catch (error) {
           this.fail(error);
         }
@@ -73,8 +75,10 @@ class Page {
     for (const [w, window] of this.windows)
       if (window && this.windows.size > MOST_WINDOWS && shares[w] === 0 && ahead[w] === 0) {
         window.free();
+        this.details.remove(window.row);
         this.windows.delete(w);
       }
+    this.details.feed(this.camera);
   }
 
   fail(error) {
@@ -98,7 +102,7 @@ class Page {
     const total = shares.reduce((a, b) => a + b, 0);
     const most = shares.indexOf(Math.max(...shares));
     const alone = this.alone && this.alone.window === most ? this.alone.head : -1;
-    const view = { eye: camera.eye, turn: camera.axes.flat(), lens, height, mode: this.mode, alone };
+    const view = { eye: camera.eye, turn: camera.axes.flat(), lens, height, mode: this.mode, alone, detailed: this.mode || alone >= 0 ? null : camera };
     shares.forEach((share, w) => {
       const part = this.mode || alone >= 0 ? Number(w === most) : share / total;
       if (share > 0 && part > 0) this.windows.get(w).draw(view, part);
@@ -252,17 +256,24 @@ function decoded(id) {
   return bytes;
 }
 
-// Bytes of a window, its first part and the rest: from the page itself where they are in it, else from beside it.
+// Bytes of a window (its first part, the rest of its bricks, and details) from the page itself where they are in it, else
+// from beside it.
 function fetchWindow(row, progress) {
-  if ($(row.file)) return [Promise.resolve(decoded(row.file)), parsed.then(() => decoded(`${row.file}.rest`))];
-  let first, failed;
-  const part = new Promise((...both) => { [first, failed] = both; });
-  const rest = readWindow(row, progress, first);
-  rest.catch(failed);
-  return [part, rest];
+  if ($(row.file)) {
+    const later = (name) => parsed.then(() => decoded(`${row.file}.${name}`));
+    return [Promise.resolve(decoded(row.file)), later("rest"), later("details")];
+  }
+  const parts = [row.first_bytes, row.bricks_bytes, row.bytes].map((end) => {
+    const part = { end };
+    part.bytes = new Promise((resolve, reject) => Object.assign(part, { resolve, reject }));
+    part.bytes.catch(() => {}); // the first one tells
+    return part;
+  });
+  readWindow(row, progress, parts).catch((error) => parts.forEach((part) => part.reject(error)));
+  return parts.map((part) => part.bytes);
 }
 
-async function readWindow(row, progress, first) {
+async function readWindow(row, progress, parts) {
   const response = await fetch(row.file, { cache: "no-cache" });
   if (!response.ok) throw new Refusal(`${row.file} is missing beside this page: copy the whole folder.`);
   const reader = response.body.getReader(), bytes = new Uint8Array(row.bytes);
@@ -273,11 +284,11 @@ async function readWindow(row, progress, first) {
     if (at + value.length > row.bytes) throw new Refusal(`${row.file} is longer than scene.json says: copy the folder anew.`);
     bytes.set(value, at);
     at += value.length;
-    if (at >= row.first_bytes) first(bytes.subarray(0, row.first_bytes));
-    progress(Math.min(at / row.bytes, 0.99));
+    parts.forEach(({ end, resolve }, i) => { if (at >= end && end < row.bytes) resolve(bytes.subarray(i && parts[i - 1].end, end)); });
+    if (at < row.bricks_bytes) progress(at / row.bricks_bytes);
   }
   if (at < row.bytes) throw new Refusal(`${row.file} is cut short (${at} of ${row.bytes} bytes): copy it anew.`);
-  return bytes.subarray(row.first_bytes);
+  parts.forEach(({ end, resolve }, i) => resolve(bytes.subarray(i && parts[i - 1].end, end)));
 }
 
 async function fetchHeader() {

@@ -108,8 +108,8 @@ function halves(data) {
 
 function checkHeader(header) {
   if (!header || header.format !== "mmpi-baked") throw new Refusal("scene.json is not the header of a baked scene.");
-  if (header.version !== 3)
-    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 3: export it again.`);
+  if (header.version !== 4)
+    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 4: export it again.`);
   return header;
 }
 
@@ -190,15 +190,18 @@ function networkBlock(shader, numbers, size) {
 
 // One window on the graphics card: first the bricks that are seen most, at half of their resolution, then all of it.
 class WindowOnCard {
-  static async load(gl, row, bytes) {
+  // `details` says how many training images a picture takes details from, and binds them.
+  static async load(gl, row, bytes, details) {
     const { arrays, channels } = row, limit = gl.getParameter(gl.MAX_TEXTURE_SIZE), per = limit >= 4096 ? 512 : 256;
-    const card = Object.assign(new WindowOnCard(), { gl, row, per, textures: [], heads: row.mpis.length, whole: false });
+    const card = Object.assign(new WindowOnCard(), { gl, row, per, details, textures: [], heads: row.mpis.length, whole: false });
     if (Math.ceil(arrays.fine.shape[2] / per) * 8 > limit)
       throw new Refusal("This scene is larger than the textures of this graphics card: export fewer bricks (--least).");
     const network = networkSource(row.shader, channels.length);
     if (network.size * 16 > gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE))
       throw new Refusal("The network of this scene is too wide for this graphics card.");
     card.groups = Math.ceil(channels.length / 4);
+    const uniforms = 8 * (card.heads + details.nearest) + 32; // vectors, at most
+    card.detailed = details.nearest > 0 && uniforms <= gl.getParameter(gl.MAX_FRAGMENT_UNIFORM_VECTORS);
     card.program = card.compile(network.source);
     card.earlyMasks = await unpack(bytes, arrays.early_columns);
     card.early = await unpack(bytes, arrays.early);
@@ -249,10 +252,13 @@ class WindowOnCard {
       `sums[${g}] += weight / (1.0 + exp(-(low[${g}] + step_[${g}] * textureLod(texels[${g}], uv, 0.0))));`);
     const fragment = "#version 300 es\n" + MARCH
       .replace("NETWORK", network)
+      .replace("ADD_DETAILS", this.detailed ? "color = detailed(color, direction, surface);" : "")
+      .replace("DETAILS", this.detailed ? DETAILS : "")
       .replace("GATHER", gather.join("\n"))
       .replace(/\/\*each\*\/([\s\S]*?)\/\*end\*\//g, (_, body) =>
         Array.from({ length: this.heads }, (_, k) => body.replaceAll("K_", k)).join("\n"))
-      .replaceAll("GROUPS", this.groups).replaceAll("HEADS", this.heads).replaceAll("COLUMNS", WORD_WIDTH);
+      .replaceAll("GROUPS", this.groups).replaceAll("HEADS", this.heads).replaceAll("COLUMNS", WORD_WIDTH)
+      .replaceAll("SEEN", this.details.nearest).replaceAll("COARSE", COARSE);
     const vertex = `#version 300 es
       void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
     const program = gl.createProgram();
@@ -311,6 +317,7 @@ class WindowOnCard {
     gl.uniform1iv(this.uniform("first"), row.mpis.map((m) => m.first_column));
     gl.uniform1f(this.uniform("rayNear"), row.ray_near);
     gl.uniform1f(this.uniform("threshold"), row.threshold);
+    gl.uniform1f(this.uniform("infinity"), 1 / row.farthest);
     gl.uniform1f(this.uniform("background"), row.background);
     gl.uniform3fv(this.uniform("exposure"), row.exposure || [1, 1, 1]);
     gl.uniform2f(this.uniform("densityCodes"), row.density.low, row.density.step);
@@ -345,6 +352,7 @@ class WindowOnCard {
     gl.uniform1i(this.uniform("mode"), view.mode);
     gl.uniform1i(this.uniform("alone"), view.alone);
     gl.uniform1f(this.uniform("share"), share);
+    if (this.detailed) this.details.bind((name) => this.uniform(name), this.textures.length, view.detailed);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 

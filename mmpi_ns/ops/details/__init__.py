@@ -9,20 +9,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from mmpi_ns.ops.build import call_in_parts
+from mmpi_ns.ops.build import HEADERS, call_in_parts
 from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.ends import numbers_in
 from mmpi_ns.ops.layout import dense
 
-TURN = 0.01
-"""Angle between the viewing directions of a surface below which weights hardly grow, radians."""
-FADE = 0.2
-"""Angle at which half of a difference is left, radians. From the side, surfaces look different, and errors of depths
-displace details."""
-SAME_DEPTH = 0.05
-"""Relative difference of inverse depths within which two images show the same surface."""
-SAME_PIXELS = 0.5
-"""... or displacement by their difference, pixels."""
-TINY = 1e-9
+TEXT = (HEADERS / "details.h").read_text(encoding="utf-8")
+"""Lines that both C++ and GLSL understand: the numbers below with what they mean, and the weights."""
+_NUMBERS = numbers_in(TEXT)
+TURN = _NUMBERS["TURN"]
+FADE = _NUMBERS["FADE"]
+SAME_DEPTH = _NUMBERS["SAME_DEPTH"]
+SAME_PIXELS = _NUMBERS["SAME_PIXELS"]
+STRENGTH = _NUMBERS["STRENGTH"]
+LEAST_WEIGHT = _NUMBERS["LEAST_WEIGHT"]
+TINY = _NUMBERS["TINY"]
 
 
 class SeenDetails(NamedTuple):

@@ -7,7 +7,8 @@
 
 namespace {
 
-constexpr float TURN = 0.01f, FADE = 0.2f, SAME_DEPTH = 0.05f, SAME_PIXELS = 0.5f, TINY = 1e-9f; // as in __init__.py
+using std::exp, std::max, std::min;
+#include "details.h"
 
 float norm(const float* v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
 
@@ -64,11 +65,10 @@ void mmpi_seen_details(int64_t begin, int64_t end, int64_t height, int64_t width
         if (camera.project(relative, height, width, column, row)) {
             look_up(image, height, width, column, row, values);
             const float there = values[3], here = inverse[i] / length;
-            const float margin = SAME_DEPTH * std::max(there, here) + SAME_PIXELS / std::max(camera.fx * norm(towards), TINY);
             for (int k = 0; k < 3; k++) turn[k] = relative[k] / length - direction[k];
-            const float apart = (there - here) / margin, angle = norm(turn);
-            if (there >= 0) weight[i] = std::exp(-std::min(apart * apart, 80.0f)) / (angle + TURN);
-            for (int k = 0; k < 3; k++) values[k] /= 1 + angle / FADE * (angle / FADE);
+            const float angle = norm(turn);
+            if (there >= 0) weight[i] = agreement(there, here, camera.fx * norm(towards), angle);
+            for (int k = 0; k < 3; k++) values[k] *= faded(angle);
         }
         for (int k = 0; k < 3; k++) difference[3 * i + k] = values[k];
     }

@@ -1,0 +1,109 @@
+"""Details of training images in a baked scene: differences and depths as WebP, which browsers read (docs/export.md)."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from mmpi_ns.rendering.details import Details, DetailView
+
+STEP = 1 / 381
+"""Of codes of differences: two thirds of a grey level."""
+ZERO = 128
+"""Code of no difference."""
+QUALITY = 80
+"""Of differences as WebP."""
+COARSE = 4
+"""Rows and columns of an image for each of its depths."""
+MOST_SIDE = 2048
+"""Pixels along a side of a difference; larger ones are kept smaller."""
+
+
+@dataclass(frozen=True)
+class StoredView:
+    """A training image, as ``DetailView``, in the bytes that are written."""
+
+    camera: tuple[float, ...]
+    """As ``DetailView.camera``, for an image of this size."""
+    size: tuple[int, int]
+    """Width and height, pixels."""
+    most: float
+    """Inverse distance of code 255."""
+    difference: bytes
+    """Codes of red, green and blue."""
+    inverse: bytes
+    """Codes of inverse distances, without loss: 0 is masked."""
+
+
+def stored_view(view: DetailView) -> StoredView:
+    """What is written of a training image."""
+    masked = view.image[..., 3:] < 0
+    planes = torch.where(masked, 0.0, view.image[..., :3]).movedim(-1, 0)[None]
+    height, width = planes.shape[2:]
+    scale = min(1.0, MOST_SIDE / max(height, width))
+    if scale < 1:
+        height, width = (max(1, round(scale * x)) for x in (height, width))
+        planes = interpolate(planes, (height, width), mode="area")
+    camera = view.camera.clone()
+    camera[12:16] *= torch.tensor([width, height] * 2) / torch.tensor([view.image.shape[1], view.image.shape[0]] * 2)
+    inverse = view.image[None, None, ..., 3].float()
+    inverse = interpolate(inverse, (-(-height // COARSE), -(-width // COARSE)), mode="nearest-exact")[0, 0]
+    most = max(float(inverse.max()), 1e-12)
+    depths = torch.where(inverse < 0, 0, 1 + (254 * (inverse.clamp(min=0) / most).sqrt()).round())
+    colours = (ZERO + planes[0].movedim(0, -1) / STEP).round().clamp(0, 255)
+    return StoredView(
+        tuple(float(f"{x:.8g}") for x in camera.tolist()),
+        (width, height),
+        most,
+        _webp(colours, quality=QUALITY),
+        _webp(depths, lossless=True),
+    )
+
+
+def _webp(codes: Tensor, **how: int) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(codes.to(torch.uint8).cpu().numpy()).convert("RGB").save(file, "WEBP", method=6, **how)
+    return file.getvalue()
+
+
+def restored_view(view: StoredView, device: torch.device) -> DetailView:
+    """The training image that ``stored_view`` was made of, as nearly as it was kept.
+
+    Raises:
+        OSError: an image is damaged.
+    """
+    width, height = view.size
+    codes = torch.from_numpy(_pixels(view.inverse)[..., 0].copy()).float()
+    codes = interpolate(codes[None, None], (height, width), mode="bilinear", align_corners=False)[0, 0]
+    inverse = view.most * ((codes - 1).clamp(min=0) / 254).square()
+    difference = STEP * (torch.from_numpy(_pixels(view.difference).copy()).float() - ZERO)
+    image = torch.cat([difference, torch.where(codes < 0.5, -1.0, inverse)[..., None]], -1)
+    return DetailView(image.to(device), torch.tensor(view.camera, device=device))
+
+
+def _pixels(data: bytes) -> UInt8[NDArray[np.uint8], "H W 3"]:
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+
+def cameras_of(views: tuple[StoredView, ...]) -> Float[Tensor, "N 24"]:
+    return torch.tensor([view.camera for view in views])
+
+
+def restored_details(views: tuple[StoredView, ...]) -> Details:
+    """Details of a baked scene. Raises ValueError, when an image is needed that is damaged."""
+
+    def read(i: int, device: torch.device) -> DetailView:
+        try:
+            return restored_view(views[i], device)
+        except (OSError, ValueError, SyntaxError) as error:
+            raise ValueError(f"Details of training image {i} are damaged ({error}): bake the scene again.") from error
+
+    return Details(cameras_of(views), read)

@@ -1,0 +1,20 @@
+// How much a training image counts where it shows the surface of a ray. C++ and GLSL both read this file: the page's
+// shader has it at its head (export/web.py), and Python reads its numbers (ops/details).
+const float TURN = 0.01;        // angle of viewing directions below which weights hardly grow, radians
+const float FADE = 0.2;         // angle at which half of a difference is left, radians
+const float SAME_DEPTH = 0.05;  // relative difference of inverse depths within which two images show one surface
+const float SAME_PIXELS = 0.5;  // ... or displacement by their difference, pixels
+const float STRENGTH = 0.9;     // share of a difference that is shown: the rest does not recur in other views
+const float LEAST_WEIGHT = 0.1; // total weight of training images below which details fade
+const float TINY = 1e-9;
+
+// Weight of a surface at inverse distance there in an image in which it appears at here, a unit of which displaces
+// it by shift pixels.
+float agreement(float there, float here, float shift, float turn) {
+    float margin = SAME_DEPTH * max(there, here) + SAME_PIXELS / max(shift, TINY);
+    float apart = (there - here) / margin;
+    return exp(-min(apart * apart, float(80))) / (turn + TURN);
+}
+
+// What is left of a difference at an angle. From the side surfaces look different, and wrong depths displace details.
+float faded(float turn) { return float(1) / (float(1) + turn / FADE * (turn / FADE)); }
