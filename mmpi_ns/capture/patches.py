@@ -38,7 +38,7 @@ RANDOM, BEYOND = 8, 4.0
 """Random planes for each pixel of the smallest size, and how far they reach beyond the nearest and farthest points."""
 STRIDE = 2
 """Pixels between the pixels of a patch."""
-MIN_ALIKE = 0.5
+MIN_ALIKE = 0.7
 """Least correlation of a plane that is kept (``ops/patches.Patches``)."""
 NOISE, MAX_RELATIVE = 0.75, 0.15
 """Standard deviation of a depth as a motion in the second best neighbour, pixels; largest relative error."""
