@@ -262,7 +262,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
 
 
 def filled(depth: Depth, inverse: Map, error: Map) -> Depth:
-    """Measured depths, and others [h, w] where there are none, unless one measured nearby differs, as it does at an edge."""
+    """Measured depths, and others [h, w] where there are none, unless one measured nearby differs, as at an edge."""
     kernel, is_measured = np.ones((EDGE, EDGE), np.uint8), depth.inverse > 0
     nearest = cv2.dilate(depth.inverse, kernel)
     farthest = cv2.erode(np.where(is_measured, depth.inverse, 1e30).astype(np.float32), kernel)
