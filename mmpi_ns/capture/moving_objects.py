@@ -48,10 +48,10 @@ NARROW, UPRIGHT, LOW = 0.4, 1.05, 0.8
 """Width over the height of the camera below which an object is a person, as tall as the second, with a head of other
 colours than its body; others are filled up to the third."""
 CORE = 0.1
-"""Share of an object, where neighbours show what is behind it, that seeds cover, at least: else it is a strip that fell
-out of what stands."""
+"""Share of an object that seeds cover, at least, and half of it where neighbours say nothing: else it is a strip that
+fell out of what stands."""
 UNSEEN, GAP, LOWEST = 0.5, 3, 0.3
-"""Share of pixels beside an object or below it about which neighbours say nothing, from which on it may reach there; the
+"""Share of pixels beside an object or below it about which neighbours say nothing, from which it may reach there; the
 gap between is its width over the second, at most; and rows below it over those below the horizon, at most, for it to
 be cut off there."""
 CERTAIN = 10
@@ -185,7 +185,7 @@ def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int,
     closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     _, labels = cv2.connectedComponents(closed)
     whole = without_holes(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])))
-    return whole if part.sum() > CORE * (whole & judged).sum() else np.zeros_like(whole)
+    return whole if part.sum() > CORE * (whole.sum() + (whole & judged).sum()) / 2 else np.zeros_like(whole)
 
 
 def _cut(color: NDArray[np.uint8], surely: Mask, perhaps: Mask) -> Mask:
