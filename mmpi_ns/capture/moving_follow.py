@@ -3,7 +3,7 @@
 Somebody who walks ahead of the camera looks like a static thing far away, and optical flow is lost where the camera
 turns. So objects that are taller than wide are searched around their place in images that are turned alike, at a few
 sizes, by normalised correlation (``cv2.matchTemplate``) at half the size. What is seen there moves if no depth that
-something static can have brings it there. It is followed on from there, in both directions, until it is lost.
+something static can have brings it there, and counts if it was seen to move in two images.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from mmpi_ns.capture.moving_evidence import SOLID, Bytes, Mask, Shot, Warp
 from mmpi_ns.capture.views import View
 
-AFTER, IMAGES = 4, 5
-"""Nearest neighbours from which objects are followed, and images through which they are."""
+AFTER = 4
+"""Nearest neighbours from which objects are followed."""
 ASIDE, UP = 0.12, 0.05
 """Places around its own in which an object is searched, in widths of the image."""
 SIZES = (0.87, 1.0, 1.15)
@@ -34,8 +34,8 @@ DEPTHS, REACH, APART = 24, 1.2, 1.5
 they put an object and where it was, from which on it moves."""
 INNER = 3
 """Pixels across which an object is shrunk: its outline is uncertain."""
-THERE = 0.9
-"""Share of an object that is masked anyway, up to which it is followed on."""
+AGAIN = 0.5
+"""Share of what is followed that is masked anyway in one image, at least: what is seen to move once may be wrong."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,20 @@ class Half:
     """Inverse depth of the nearest content."""
     ground: NDArray[np.float32]
     """Its inverse depth, 0 where there is none. [h, w]"""
+    objects: NDArray[np.int16]
+    """Number of the object that moves there, from 1 on. [h, w]"""
 
     @staticmethod
-    def of(shot: Shot) -> Half:
+    def of(shot: Shot, moves: Mask) -> Half:
         view, measured = shot.view.reduced(2), shot.depth.inverse[shot.depth.inverse > 0]
         height, width = view.gray.shape
         ground = np.zeros((height, width), np.float32) if shot.ground is None else shot.ground
         ground = np.asarray(cv2.resize(ground, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
         color = np.asarray(cv2.resize(shot.color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-        return Half(view, color, shot.color, float(np.percentile(measured, 98)) if len(measured) else 0.0, ground)
+        small = cv2.resize(moves.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        objects = cv2.connectedComponents(small, ltype=cv2.CV_16U)[1].astype(np.int16)
+        nearest = float(np.percentile(measured, 98)) if len(measured) else 0.0
+        return Half(view, color, shot.color, nearest, ground, objects)
 
 
 def upright_objects(
@@ -73,68 +78,58 @@ def upright_objects(
         masks: what moves in each. [h, w]
         pool: for several images at a time.
     """
+    result = [np.zeros_like(mask) for mask in masks]
     if not any(mask.any() for mask in masks):
-        return [np.zeros_like(mask) for mask in masks]
-    halves = list(pool.map(Half.of, shots))
-    there = [cv2.resize(m.astype(np.uint8), h.view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-             for m, h in zip(masks, halves, strict=True)]  # fmt: skip
-    every, fresh = [np.zeros_like(mask) for mask in there], list(there)
+        return result
+    halves = list(pool.map(Half.of, shots, masks))
 
-    def seen_in(i: int) -> tuple[Mask, Mask]:
-        return _seen(halves[i], [(halves[j], fresh[j]) for j in near[i][:AFTER]], there[i] | every[i])
+    def seen_in(i: int) -> list[tuple[int, int, Mask]]:
+        return [(j, label, part) for j in near[i][:AFTER] for label, part in objects_in(halves[i], halves[j])]
 
-    for _ in range(IMAGES):
-        seen = list(pool.map(seen_in, range(len(shots))))
-        every = [mask | now for mask, (now, _) in zip(every, seen, strict=True)]
-        fresh = [new for _, new in seen]
-        if not any(mask.any() for mask in fresh):
-            break
-    return [cv2.resize(mask.astype(np.uint8), full.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-            for mask, full in zip(every, masks, strict=True)]  # fmt: skip
-
-
-def _seen(shot: Half, others: Sequence[tuple[Half, Mask]], masked: Mask) -> tuple[Mask, Mask]:
-    """Where a shot shows objects of others, and where those are not masked yet. [h, w] each"""
-    every, new = np.zeros((2, *masked.shape), bool)
-    for other, moves in others:
-        for part in objects_in(shot, other, moves) if moves.any() else ():
-            every |= part
-            if masked[part].mean() < THERE:
-                new |= part
-    return every, new
+    seen = list(pool.map(seen_in, range(len(shots))))
+    moved = [half.objects > 0 for half in halves]
+    again = {
+        (j, label) for i, of_shot in enumerate(seen) for j, label, part in of_shot if moved[i][part].mean() > AGAIN
+    }
+    for i, of_shot in enumerate(seen):
+        parts = [part for j, label, part in of_shot if (j, label) in again]
+        if parts:
+            every = np.any(parts, axis=0).astype(np.uint8)
+            result[i] = cv2.resize(every, result[i].shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    return result
 
 
-def objects_in(shot: Half, other: Half, moves: Mask) -> list[Mask]:
-    """Where a shot shows each of the objects that move in another one, if it does. [h, w] each"""
+def objects_in(shot: Half, other: Half) -> list[tuple[int, Mask]]:
+    """The objects of another image that a shot shows: their numbers there, and where. [h, w] each"""
     height, width = shot.view.gray.shape
     warp = Warp.between(shot.view, other.view)
     x, y, ahead = warp.places(np.zeros((height, width), np.float32))
-    turned = cv2.remap(moves.astype(np.uint8), x, y, cv2.INTER_NEAREST) * (ahead > 0)
-    color = np.asarray(
-        cv2.remap(other.full, 2 * x + 0.5, 2 * y + 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
-    )
-    number, labels, boxes, centers = cv2.connectedComponentsWithStats(turned)
+    turned = cv2.remap(other.objects, x, y, cv2.INTER_NEAREST) * (ahead > 0)
+    if not turned.any():
+        return []
+    color = cv2.remap(other.full, 2 * x + 0.5, 2 * y + 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     result = []
-    for label in range(1, number):
-        left, top, wide, high, area = (int(n) for n in boxes[label])
-        if area < LEAST_AREA or not LEAST_SIDE <= wide <= high:
+    for label in np.setdiff1d(turned, [0]):
+        rows, columns = np.nonzero(turned == label)
+        left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+        if len(rows) < LEAST_AREA or not LEAST_SIDE <= right - left <= bottom - top:
             continue
-        box = np.s_[top : top + high, left : left + wide]
-        shape = labels[box] == label
-        place = search(shot.color, color[box], shape, (left, top))
+        box = np.s_[top:bottom, left:right]
+        shape = turned[box] == label
+        place = search(shot.color, np.asarray(color[box], np.uint8), shape, (int(left), int(top)))
         if place is None:
             continue
-        size, column, row = place
+        size, first, above = place
         outline = cv2.resize(shape.astype(np.uint8), None, fx=size, fy=size, interpolation=cv2.INTER_NEAREST)
-        rows, columns = outline.shape
-        middle = (centers[label] - (left, top)) * size + (column, row)
-        if _may_stand(shot, warp, middle, centers[label], row + rows - 1):
+        before = np.array([columns.mean(), rows.mean()])
+        middle = (before - (left, top)) * size + (first, above)
+        if _may_stand(shot, warp, middle, before, above + len(outline) - 1):
             continue
         part = np.zeros((height, width), np.uint8)
-        part[row : row + rows, column : column + columns] = outline
-        part = cv2.erode(part, np.ones((INNER, INNER), np.uint8), borderValue=1) > 0
+        part[above : above + outline.shape[0], first : first + outline.shape[1]] = outline
+        part = cv2.erode(part, np.ones((INNER, INNER), np.uint8)) > 0
         if part.any():
-            result.append(part)
+            result.append((int(label), part))
     return result
 
 
