@@ -50,7 +50,7 @@ colours than its body; others are filled up to the third."""
 CORE = 0.1
 """Share of an object that seeds cover, at least, and half of it where neighbours say nothing: else it is a strip that
 fell out of what stands."""
-UNSEEN, GAP, LOWEST = 0.5, 3, 0.3
+UNSEEN, GAP, LOWEST = 0.5, 3, 0.24
 """Share of pixels beside an object or below it about which neighbours say nothing, from which it may reach there; the
 gap between is its width over the second, at most; and rows below it over those below the horizon, at most, for it to
 be cut off there."""
@@ -152,10 +152,9 @@ def room_of(shot: Shot, judged: Mask, part: Mask) -> tuple[tuple[int, int, int, 
     horizon = height if shot.horizon is None else float(shot.horizon[left:right].mean())
     near = np.ones((1, 2 * ((right - left) // GAP // 2) + 1), np.uint8)
     seen = cv2.dilate((judged[top:bottom].mean(0) < 1 - UNSEEN).astype(np.uint8)[None], near)[0] == 0
-    before, after = np.flatnonzero(seen[:left]), np.flatnonzero(seen[right:])
     aside = max(3, round(0.12 * (right - left)))
-    room_left = min(left - aside, before[-1] + 1 if len(before) else 0)
-    room_right = max(right + aside, right + after[0] if len(after) else width)
+    room_left = left - aside if seen[:left].any() else 0
+    room_right = right + aside if seen[right:].any() else width
     below = judged[bottom + 2 :, left:right]
     if height - bottom < LOWEST * (height - horizon) and below.size and below.mean() < 1 - UNSEEN:
         bottom = height
