@@ -52,8 +52,8 @@ CORE = 0.1
 fell out of what stands."""
 UNSEEN, GAP, LOWEST = 0.5, 3, 0.24
 """Share of pixels beside an object or below it about which neighbours say nothing, from which it may reach there; the
-gap between is its width over the second, at most; and rows below it over those below the horizon, at most, for it to
-be cut off there."""
+gap between is its width over twice the second, at most; and rows below it over those below the horizon, at most, for
+it to be cut off there."""
 CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
 STATIC = 0.5

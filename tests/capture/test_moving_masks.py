@@ -341,16 +341,18 @@ def test_an_object_reaches_on_to_the_border_where_neighbours_say_nothing(silent)
     color[30:, :50] = 200
     core, judged = np.zeros(SIZE, bool), np.ones(SIZE, bool)
     core[32:52, 34:50] = True
-    judged[:, :30] = judged[53:] = not silent
+    judged[:, :33] = judged[53:] = not silent
     mask = grown(*a_scene(color, 25, judged), core)
-    assert mask[32:52, 34:50].all() and not mask[:, 54:].any() and not mask[:26].any()
-    assert mask[32:58, 2:28].mean() == (1 if silent else 0)
+    assert mask[32:52, 34:50].all() and not mask[:, 56:].any()
+    assert mask[34:56, 4:28].mean() == (1 if silent else 0)
 
 
 def test_seeds_count_half_where_neighbours_say_nothing():
     core = np.zeros(SIZE, bool)
     core[4:57:13, 20:30] = True
-    shot, evidence = a_scene(np.full((*SIZE, 3), 200, np.uint8), judged=np.zeros(SIZE, bool))
+    judged = np.ones(SIZE, bool)
+    judged[4:57, 20:30] = False
+    shot, evidence = a_scene(np.full((*SIZE, 3), 200, np.uint8), judged=judged)
     assert grown(shot, evidence, core).any()
 
 
