@@ -44,6 +44,8 @@ CLEARLY, WINDOW = 80, 5
 NOISE = 75
 """Percentile of the differences of surfaces of known depth that stands for the noise; some of them move."""
 ALL = 255
+TURNED = 3.0
+"""Degrees between the facing directions of two images from which the camera turned between them."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +82,15 @@ class Evidence:
     behind: Bytes
     """By which it differs from what two neighbours agree to be behind it."""
     judged: Mask
-    """Two neighbours agree about a surface there, so that something else in front of it is seen."""
+    """Two neighbours agree about a surface there, so that something else in front of it is seen; everywhere if the
+    camera did not turn between the image and the two nearest."""
     noise: float
     """Levels by which surfaces of known depth differ from all neighbours but one, most of them."""
+
+
+def turned(view: View, other: View) -> bool:
+    """Whether the camera turned between two images."""
+    return float(view.pose[:, 2] @ other.pose[:, 2]) < np.cos(np.radians(TURNED))
 
 
 def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:
@@ -289,7 +297,7 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     shape = shot.view.gray.shape
     if len(others) < 2:
         nothing = np.zeros(shape, np.uint8)
-        return Evidence(nothing, nothing, nothing, np.zeros(shape, bool), 0.0)
+        return Evidence(nothing, nothing, nothing, np.ones(shape, bool), 0.0)
     one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
     judged = np.zeros(shape, bool)
     layers = [other.with_still(mask) for other, mask in zip(others, masks, strict=True)]
@@ -314,7 +322,9 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     decided = (showing >= 2) & shot.view.inside
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)
+    judged &= decided
+    if not any(turned(shot.view, other.shot.view) for other in others[:2]):
+        judged[:] = True
     differences = two[(shot.depth.inverse > 0) & (two < ALL)]
-    return Evidence(
-        strong, weak, behind, judged & decided, float(np.percentile(differences, NOISE)) if len(differences) else 0.0
-    )
+    noise = float(np.percentile(differences, NOISE)) if len(differences) else 0.0
+    return Evidence(strong, weak, behind, judged, noise)

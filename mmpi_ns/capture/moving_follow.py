@@ -1,8 +1,8 @@
 """People who move, followed from image to image by what they look like.
 
 Somebody who walks ahead of the camera looks like a static thing far away, and optical flow is lost where the camera
-turns. So objects that are taller than wide are searched around their place in images that are turned alike, at a few
-sizes, by normalised correlation (``cv2.matchTemplate``) at half the size. What is seen there moves if no depth that
+turns. There, objects that are taller than wide are searched around their place in images that are turned alike, at a
+few sizes, by normalised correlation (``cv2.matchTemplate``) at half the size. What is seen there moves if no depth that
 something static can have brings it there, and counts if it was seen to move in two images.
 """
 
@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.moving_evidence import SOLID, Bytes, Mask, Shot, Warp
+from mmpi_ns.capture.moving_evidence import SOLID, Bytes, Mask, Shot, Warp, turned
 from mmpi_ns.capture.views import View
 
 AFTER = 4
-"""Nearest neighbours from which objects are followed."""
+"""Nearest neighbours from which objects are followed, where the camera turned."""
 ASIDE, UP = 0.12, 0.05
 """Places around its own in which an object is searched, in widths of the image."""
 SIZES = (0.87, 1.0, 1.15)
@@ -84,7 +84,8 @@ def upright_objects(
     halves = list(pool.map(Half.of, shots, masks))
 
     def seen_in(i: int) -> list[tuple[int, int, Mask]]:
-        return [(j, label, part) for j in near[i][:AFTER] for label, part in objects_in(halves[i], halves[j])]
+        places = [j for j in near[i][:AFTER] if turned(shots[i].view, shots[j].view)]
+        return [(j, label, part) for j in places for label, part in objects_in(halves[i], halves[j])]
 
     seen = list(pool.map(seen_in, range(len(shots))))
     moved = [half.objects > 0 for half in halves]

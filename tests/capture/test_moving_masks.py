@@ -16,7 +16,7 @@ from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.capture.dense import Depth, Parallax
 from mmpi_ns.capture.moving import find_moving, gain_of, in_image
-from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, ground_of, nearest_known, splat
+from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import (
     LEAST_LEVELS,
     REACH,
@@ -347,13 +347,22 @@ def test_an_object_reaches_on_to_the_border_where_neighbours_say_nothing(silent)
     assert mask[34:56, 4:28].mean() == (1 if silent else 0)
 
 
+@pytest.mark.parametrize(("degrees", "silent"), [(2.0, False), (4.0, True)])
+def test_neighbours_are_silent_only_about_images_between_which_the_camera_turned(degrees, silent):
+    """All show pictures of their own, so that no two agree."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    shot, *others = (a_shot(0.1 * k, textured(k), 0.5) for k in range(3))
+    others[1].view.pose[:, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    judged = evidence(shot, neighbours(shot, *others), [None, None], np.zeros(SIZE, bool)).judged
+    assert judged.mean() < 0.5 if silent else judged.all()
+
+
 def test_seeds_count_half_where_neighbours_say_nothing():
     core = np.zeros(SIZE, bool)
     core[4:57:13, 20:30] = True
     judged = np.ones(SIZE, bool)
     judged[4:57, 20:30] = False
-    shot, evidence = a_scene(np.full((*SIZE, 3), 200, np.uint8), judged=judged)
-    assert grown(shot, evidence, core).any()
+    assert grown(*a_scene(np.full((*SIZE, 3), 200, np.uint8), judged=judged), core).any()
 
 
 def test_holes_are_filled_and_bays_are_not():

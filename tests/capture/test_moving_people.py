@@ -50,9 +50,9 @@ def a_shot(turn: float, step: float, person: tuple[float, float]) -> tuple[Shot,
     return Shot(view, color, Depth(ground, 0.01 * ground), ground), shown
 
 
-def seen(places, masked):
+def seen(places, masked, turns=TURNS):
     """What is followed to three images from those that are masked, and the truth."""
-    pairs = [a_shot(turn, k * STEP, place) for k, (turn, place) in enumerate(zip(TURNS, places, strict=True))]
+    pairs = [a_shot(turn, k * STEP, place) for k, (turn, place) in enumerate(zip(turns, places, strict=True))]
     truth = [shown for _, shown in pairs]
     masks = [t if k in masked else np.zeros(SIZE, bool) for k, t in enumerate(truth)]
     with ThreadPoolExecutor(1) as pool:
@@ -68,6 +68,12 @@ STANDS = [(0.3, 8.0)] * 3
 def test_somebody_ahead_is_followed_to_an_image_that_is_turned(hidden):
     parts, truth = seen(AHEAD, {0, 1, 2} - {hidden})
     assert parts[hidden][truth[hidden]].mean() > 0.5 and not parts[hidden][~truth[hidden]].any()
+
+
+@pytest.mark.parametrize(("turn", "followed"), [(0.04, False), (0.06, True)], ids=["2 degrees", "3 degrees"])
+def test_somebody_ahead_is_followed_only_where_the_camera_turns(turn, followed):
+    parts, _ = seen(AHEAD, {0, 2}, (0.0, turn, 0.0))
+    assert parts[1].any() == followed
 
 
 def test_what_is_masked_in_one_image_only_is_not_followed():
