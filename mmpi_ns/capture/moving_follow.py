@@ -20,7 +20,7 @@ from mmpi_ns.capture.moving_evidence import SOLID, Bytes, Mask, Shot, Warp, turn
 from mmpi_ns.capture.views import View
 
 AFTER = 4
-"""Nearest neighbours from which objects are followed, where the camera turned."""
+"""Nearest neighbours from which objects are followed, if the camera turned to one of them."""
 ASIDE, UP = 0.12, 0.05
 """Places around its own in which an object is searched, in widths of the image."""
 SIZES = (0.87, 1.0, 1.15)
@@ -84,8 +84,10 @@ def upright_objects(
     halves = list(pool.map(Half.of, shots, masks))
 
     def seen_in(i: int) -> list[tuple[int, int, Mask]]:
-        places = [j for j in near[i][:AFTER] if turned(shots[i].view, shots[j].view)]
-        return [(j, label, part) for j in places for label, part in objects_in(halves[i], halves[j])]
+        nearest = near[i][:AFTER]
+        if not any(turned(shots[i].view, shots[j].view) for j in nearest):
+            return []
+        return [(j, label, part) for j in nearest for label, part in objects_in(halves[i], halves[j])]
 
     seen = list(pool.map(seen_in, range(len(shots))))
     moved = [half.objects > 0 for half in halves]
