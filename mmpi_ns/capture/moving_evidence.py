@@ -45,7 +45,8 @@ NOISE = 75
 """Percentile of the differences of surfaces of known depth that stands for the noise; some of them move."""
 ALL = 255
 TURNED = 3.0
-"""Degrees between the facing directions of two images from which the camera turned between them."""
+"""Degrees between the facing directions of two images from which the camera turned between them. Where it goes straight
+on, what neighbours say nothing about is mostly what stands (docs/moving.md)."""
 
 
 @dataclass(frozen=True)
