@@ -22,6 +22,7 @@ from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
+from mmpi_ns.capture.moving_follow import upright_objects
 from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
 from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
@@ -42,14 +43,14 @@ MAX_ANGLE = 40.0
 ROUNDS = (2, 1)
 """Of dense matching: at half the size, then at that size."""
 AFTER = 2
-"""Nearest neighbours from which objects are followed."""
+"""Nearest neighbours from which objects are followed by optical flow."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.4
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is."""
-VERSION = 8
+VERSION = 9
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -83,10 +84,12 @@ def find_moving(
         near.append([nearest[rank] for rank in RANKS if rank < len(nearest)])
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        first = list(pool.map(lambda i: _moves(shots, near[i], i, masks, None), range(len(shots))))
+        first = list(pool.map(lambda i: _moves(shots, near[i], i, masks, masks[i], None), range(len(shots))))
         masks = [mask for mask, _ in first]
+        uprights = upright_objects(shots, near, masks, pool)
+        masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
         again = [i for i in range(len(shots)) if any(masks[j].any() for j in near[i])]
-        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, first[i][1]), again))
+        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i][1]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
     # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
@@ -187,9 +190,9 @@ class _First:
 
 
 def _moves(
-    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], first: _First | None
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], uprights: Mask, first: _First | None
 ) -> tuple[Mask, _First]:
-    """What moves in an image, where it is known what moves in others."""
+    """What moves in an image, where it is known what moves in others and where it shows people of theirs."""
     shot = shots[i]
     gains = first.gains if first else [gain_of(shot, shots[j]) for j in near]
     others = [Neighbour.of(shot, shots[j], gain) for j, gain in zip(near, gains, strict=True)]
@@ -205,4 +208,4 @@ def _moves(
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow) & ~static
-    return grown(shot, shown, core), first
+    return grown(shot, shown, core | uprights), first

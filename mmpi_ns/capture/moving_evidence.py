@@ -44,6 +44,9 @@ CLEARLY, WINDOW = 80, 5
 NOISE = 75
 """Percentile of the differences of surfaces of known depth that stands for the noise; some of them move."""
 ALL = 255
+TURNED = 3.0
+"""Degrees between the facing directions of two images from which the camera turned between them. Where it goes straight
+on, what neighbours say nothing about is mostly what stands (docs/moving.md)."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,16 @@ class Evidence:
     """By which it differs from all neighbours but one, two of which agree about what is behind it."""
     behind: Bytes
     """By which it differs from what two neighbours agree to be behind it."""
+    judged: Mask
+    """Two neighbours agree about a surface there, so that something else in front of it is seen; everywhere if the
+    camera did not turn between the image and the two nearest."""
     noise: float
     """Levels by which surfaces of known depth differ from all neighbours but one, most of them."""
+
+
+def turned(view: View, other: View) -> bool:
+    """Whether the camera turned between two images."""
+    return float(view.pose[:, 2] @ other.pose[:, 2]) < np.cos(np.radians(TURNED))
 
 
 def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:
@@ -223,12 +234,13 @@ class Neighbour:
 
 def _compare(
     shot: Shot, others: Sequence[Neighbour], layers: Sequence[Bytes], inverse: Map, pairs: bool
-) -> tuple[list[Bytes], Bytes]:
+) -> tuple[list[Bytes], Bytes, Mask]:
     """A shot against its neighbours, with what stands still as a fourth channel, at some inverse depths.
 
     Returns:
         Levels by which the colours of each neighbour differ, ALL where it shows nothing. [h, w] each
         Levels by which the shot differs from both of two neighbours that agree and have nothing in front. [h, w]
+        Where two neighbours do. [h, w]
     """
     kernel, four = np.ones((3, 3), np.uint8), cv2.cvtColor(shot.color, cv2.COLOR_BGR2BGRA)
     nearest, farthest = OCCLUDES * inverse, inverse / OCCLUDES
@@ -245,12 +257,13 @@ def _compare(
             theirs = cv2.multiply(cv2.remap(other.shot.around, x, y, cv2.INTER_NEAREST), ahead)
             free.append(inside & (theirs <= nearest) & (theirs >= farthest))
             warped.append(there)
-    pair = np.zeros(inverse.shape, np.uint8)
+    pair, agreed = np.zeros(inverse.shape, np.uint8), np.zeros(inverse.shape, bool)
     for a in range(len(warped)):
         for b in range(max(0, a - 2), a):
             agree = free[a] & free[b] & (most_of_channels(cv2.absdiff(warped[a], warped[b])) < SAME)
+            agreed |= agree
             pair = np.maximum(pair, all_where(agree) & np.minimum(distances[a], distances[b]))
-    return distances, pair
+    return distances, pair, agreed
 
 
 def most_of_channels(apart: NDArray[Any]) -> Bytes:
@@ -285,18 +298,20 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     shape = shot.view.gray.shape
     if len(others) < 2:
         nothing = np.zeros(shape, np.uint8)
-        return Evidence(nothing, nothing, nothing, 0.0)
+        return Evidence(nothing, nothing, nothing, np.ones(shape, bool), 0.0)
     one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
+    judged = np.zeros(shape, bool)
     layers = [other.with_still(mask) for other, mask in zip(others, masks, strict=True)]
     mine, surfaces = possible_depths(shot, others)
     for n, inverse in enumerate(mine + surfaces):
-        distances, pair = _compare(shot, others, layers, inverse, n >= len(mine))
+        distances, pair, agreed = _compare(shot, others, layers, inverse, n >= len(mine))
         possible = inverse > 0
         if shot.ground is not None:
             possible &= inverse >= SOLID * shot.ground
         first, second = (levels | all_where(~possible) for levels in two_least(distances))
         one, two = np.minimum(one, first), np.minimum(two, second)
         behind = np.maximum(behind, pair & all_where(possible))
+        judged |= agreed & possible
     # Nobody can tell where fewer than two neighbours would show even the nearest content.
     measured = shot.depth.inverse[shot.depth.inverse > 0]
     nearest = np.full(shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
@@ -308,5 +323,9 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     decided = (showing >= 2) & shot.view.inside
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)
+    judged &= decided
+    if not any(turned(shot.view, other.shot.view) for other in others[:2]):
+        judged[:] = True
     differences = two[(shot.depth.inverse > 0) & (two < ALL)]
-    return Evidence(strong, weak, behind, float(np.percentile(differences, NOISE)) if len(differences) else 0.0)
+    noise = float(np.percentile(differences, NOISE)) if len(differences) else 0.0
+    return Evidence(strong, weak, behind, judged, noise)

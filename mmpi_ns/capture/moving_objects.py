@@ -48,7 +48,12 @@ NARROW, UPRIGHT, LOW = 0.4, 1.05, 0.8
 """Width over the height of the camera below which an object is a person, as tall as the second, with a head of other
 colours than its body; others are filled up to the third."""
 CORE = 0.1
-"""Share of an object that seeds cover, at least: else it is a strip that fell out of what stands."""
+"""Share of an object that seeds cover, at least, and half of it where neighbours say nothing: else it is a strip that
+fell out of what stands."""
+UNSEEN, GAP, LOWEST = 0.5, 3, 0.24
+"""Share of pixels beside an object or below it about which neighbours say nothing, from which it may reach there; the
+gap between is its width over twice the second, at most; and rows below it over those below the horizon, at most, for
+it to be cut off there."""
 CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
 STATIC = 0.5
@@ -125,26 +130,43 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
         rows, columns = np.nonzero(part)
         if len(rows) < LEAST_PIXELS or min(np.ptp(rows), np.ptp(columns)) < LEAST_SIDE:
             continue
-        # What the object of these seeds may cover, and the row from which it is its body.
-        left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
-        highest, body = top - 0.3 * (bottom - top), top
-        horizon = bottom if shot.horizon is None else float(shot.horizon[left:right].mean())
-        if bottom > horizon:  # something that stands on the ground, as seen from the camera's height
-            highest = min(top - 0.1 * (bottom - top), bottom - TALL * (bottom - horizon))
-            tall = UPRIGHT if right - left < NARROW * (bottom - horizon) else LOW
-            body = min(top, round(bottom - tall * (bottom - horizon)))
-        aside = max(3, round(0.12 * (right - left)))
-        result |= _object(shot, part, static, (left - aside, int(highest), right + aside, bottom + 2), body)
+        room, body = room_of(shot, evidence.judged, part)
+        result |= _object(shot, part, evidence.judged, static, room, body)
     for left, top, right, bottom in shot.people:
         # What a person surely covers: the third in the middle.
         body, third = np.zeros_like(core), (right - left) // 3
         body[max(0, top) : bottom, max(0, left + third) : right - third] = True
         if body.any() and static[body].mean() < STATIC:
-            result |= _object(shot, body, static, (left, top, right, bottom), top)
+            result |= _object(shot, body, evidence.judged, static, (left, top, right, bottom), top)
     return result
 
 
-def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int], body: int) -> Mask:
+def room_of(shot: Shot, judged: Mask, part: Mask) -> tuple[tuple[int, int, int, int], int]:
+    """Left, top, right and bottom of what the object of some seeds may cover, and the row from which it is its body.
+
+    Seeds lie only where neighbours show what is behind them. Next to the border of an image few do, so an object may
+    reach on to where they say nothing.
+    """
+    (height, width), (rows, columns) = part.shape, np.nonzero(part)
+    left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
+    horizon = height if shot.horizon is None else float(shot.horizon[left:right].mean())
+    near = np.ones((1, 2 * ((right - left) // GAP // 2) + 1), np.uint8)
+    seen = cv2.dilate((judged[top:bottom].mean(0) < 1 - UNSEEN).astype(np.uint8)[None], near)[0] == 0
+    aside = max(3, round(0.12 * (right - left)))
+    room_left = left - aside if seen[:left].any() else 0
+    room_right = right + aside if seen[right:].any() else width
+    below = judged[bottom + 2 :, left:right]
+    if height - bottom < LOWEST * (height - horizon) and below.size and below.mean() < 1 - UNSEEN:
+        bottom = height
+    highest, body = top - 0.3 * (bottom - top), top
+    if shot.horizon is not None and bottom > horizon:  # it stands on the ground, as seen from the camera's height
+        highest = min(top - 0.1 * (bottom - top), bottom - TALL * (bottom - horizon))
+        tall = UPRIGHT if right - left < NARROW * (bottom - horizon) else LOW
+        body = min(top, round(bottom - tall * (bottom - horizon)))
+    return (int(room_left), int(highest), int(room_right), int(bottom) + 2), int(body)
+
+
+def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int, int, int, int], body: int) -> Mask:
     """The object that covers some pixels for certain and others in its room perhaps."""
     height, (left, top, right, bottom) = len(part), room
     margin = max(8, round(0.3 * max(right - left, bottom - max(0, top))))
@@ -162,7 +184,7 @@ def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int
     closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     _, labels = cv2.connectedComponents(closed)
     whole = without_holes(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])))
-    return whole if part.sum() > CORE * whole.sum() else np.zeros_like(whole)
+    return whole if part.sum() > CORE * (whole.sum() + (whole & judged).sum()) / 2 else np.zeros_like(whole)
 
 
 def _cut(color: NDArray[np.uint8], surely: Mask, perhaps: Mask) -> Mask:

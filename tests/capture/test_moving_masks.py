@@ -16,7 +16,7 @@ from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.capture.dense import Depth, Parallax
 from mmpi_ns.capture.moving import find_moving, gain_of, in_image
-from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, ground_of, nearest_known, splat
+from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import (
     LEAST_LEVELS,
     REACH,
@@ -68,7 +68,7 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     nothing = Depth(*np.zeros((2, 20, 50), np.float32))
     shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), nothing, None) for _ in range(3)]
 
-    def moves(shots, near, i, masks, first):
+    def moves(shots, near, i, masks, uprights, first):
         mask = np.zeros((20, 50), bool)
         mask.flat[: (16 if large else 14) if i == 1 else 3] = True
         return mask, None
@@ -82,10 +82,10 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     assert [int(mask.sum()) for mask in masks] == ([3, 16, 3] if large else [0, 0, 0])
 
 
-def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed(monkeypatch):
-    """One row: swept, followed, a seed, each with a static pixel and one that is not."""
-    swept, followed_pixels, seed, static = (np.zeros((1, 6), bool) for _ in range(4))
-    swept[0, :2] = followed_pixels[0, 2:4] = seed[0, 4:] = static[0, ::2] = True
+def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed_or_a_person(monkeypatch):
+    """One row: swept, followed by flow, a seed, a person, each with a static pixel and one that is not."""
+    swept, followed_pixels, seed, person, static = (np.zeros((1, 8), bool) for _ in range(5))
+    swept[0, :2] = followed_pixels[0, 2:4] = seed[0, 4:6] = person[0, 6:] = static[0, ::2] = True
     monkeypatch.setattr(moving.Neighbour, "of", lambda *_: None)
     sweeps = moving.Sweep(swept, swept)
     for name, value in (
@@ -94,11 +94,11 @@ def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed
     ):  # fmt: skip
         monkeypatch.setattr(moving, name, lambda *_, value=value: value)
     monkeypatch.setattr(moving, "grown", lambda shot, shown, core: core)
-    masks = [np.ones((1, 6), bool)] * 3
-    nothing = Depth(*np.zeros((2, 1, 6), np.float32))
-    shot = Shot(View(np.zeros((1, 6), np.uint8), np.ones(4), np.eye(4)[:3], static), np.zeros((1, 6, 3)), nothing, None)
-    core, _ = moving._moves([shot] * 3, [1, 2], 0, masks, None)
-    assert core[0].tolist() == [False, True, False, True, True, True]
+    masks = [np.ones((1, 8), bool)] * 3
+    nothing = Depth(*np.zeros((2, 1, 8), np.float32))
+    shot = Shot(View(np.zeros((1, 8), np.uint8), np.ones(4), np.eye(4)[:3], static), np.zeros((1, 8, 3)), nothing, None)
+    core, _ = moving._moves([shot] * 3, [1, 2], 0, masks, person, None)
+    assert core[0].tolist() == [False, True, False, True, True, True, True, True]
 
 
 def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):
@@ -219,9 +219,9 @@ def test_levels_are_asked_once_and_are_those_of_a_single_time():
     strong, nothing = np.zeros(SIZE, np.uint8), np.zeros(SIZE, np.uint8)
     for left in (20, 60):
         strong[10:40, 10:left] = 255
-        twice = seeds(shot, neighbours(shot, *others), Evidence(strong, nothing, nothing, 0.0), levels)
+        twice = seeds(shot, neighbours(shot, *others), Evidence(strong, nothing, nothing, nothing > 0, 0.0), levels)
     afresh = np.full(SIZE, UNASKED, np.int16)
-    once = seeds(shot, neighbours(shot, *others), Evidence(strong, nothing, nothing, 0.0), afresh)
+    once = seeds(shot, neighbours(shot, *others), Evidence(strong, nothing, nothing, nothing > 0, 0.0), afresh)
     assert once.any() and (twice == once).all() and (levels == afresh).all()
 
 
@@ -308,11 +308,12 @@ def test_what_moves_along_is_followed_to_an_image_that_is_turned():
     assert seen[mask > 0].mean() > 0.7 and seen[mask == 0].mean() < 0.01
 
 
-def a_scene(color, horizon=None):
+def a_scene(color, horizon=None, judged=None):
     nothing = np.zeros(SIZE, np.uint8)
+    judged = np.ones(SIZE, bool) if judged is None else judged
     row = None if horizon is None else np.full(SIZE[1], float(horizon))
     shot = Shot(a_view(), color, Depth(*np.zeros((2, *SIZE), np.float32)), None, row)
-    return shot, Evidence(nothing, nothing, nothing, 0.0)
+    return shot, Evidence(nothing, nothing, nothing, judged, 0.0)
 
 
 @pytest.mark.parametrize(("width", "reaches"), [(10, True), (30, False)], ids=["person", "car"])
@@ -331,6 +332,37 @@ def test_an_object_that_seeds_hardly_cover_is_none(apart, kept):
     core = np.zeros(SIZE, bool)
     core[4:57:apart, 20:30] = True
     assert grown(*a_scene(np.full((*SIZE, 3), 200, np.uint8)), core).any() == kept
+
+
+@pytest.mark.parametrize("silent", [True, False], ids=["nothing is said", "all is judged"])
+def test_an_object_reaches_on_to_the_border_where_neighbours_say_nothing(silent):
+    """A car of one colour that leaves at the left and below; seeds lie on its right end."""
+    color = np.full((*SIZE, 3), 60, np.uint8)
+    color[30:, :50] = 200
+    core, judged = np.zeros(SIZE, bool), np.ones(SIZE, bool)
+    core[32:52, 34:50] = True
+    judged[:, :33] = judged[53:] = not silent
+    mask = grown(*a_scene(color, 25, judged), core)
+    assert mask[32:52, 34:50].all() and not mask[:, 56:].any()
+    assert mask[34:56, 4:28].mean() == (1 if silent else 0)
+
+
+@pytest.mark.parametrize(("degrees", "silent"), [(2.0, False), (4.0, True)])
+def test_neighbours_are_silent_only_about_images_between_which_the_camera_turned(degrees, silent):
+    """All show pictures of their own, so that no two agree."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    shot, *others = (a_shot(0.1 * k, textured(k), 0.5) for k in range(3))
+    others[1].view.pose[:, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    judged = evidence(shot, neighbours(shot, *others), [None, None], np.zeros(SIZE, bool)).judged
+    assert judged.mean() < 0.5 if silent else judged.all()
+
+
+def test_seeds_count_half_where_neighbours_say_nothing():
+    core = np.zeros(SIZE, bool)
+    core[4:57:13, 20:30] = True
+    judged = np.ones(SIZE, bool)
+    judged[4:57, 20:30] = False
+    assert grown(*a_scene(np.full((*SIZE, 3), 200, np.uint8), judged=judged), core).any()
 
 
 def test_holes_are_filled_and_bays_are_not():

@@ -1,0 +1,91 @@
+"""Somebody who walks ahead is followed to images that show nothing of it by themselves; what stands is not."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+import pytest
+
+from mmpi_ns.capture.dense import Depth
+from mmpi_ns.capture.moving_evidence import Shot
+from mmpi_ns.capture.moving_follow import upright_objects
+from mmpi_ns.capture.views import View
+
+SIZE, FOCAL, HEIGHT, STEP = (120, 200), 200.0, 1.5, 1.0
+"""Rows and columns, pixels, metres of the cameras over the ground and between them."""
+TURNS = (0.0, 0.14, 0.28)
+"""Radians to the right by which the cameras are turned: 28 pixels between two."""
+
+
+def texture(seed: int, shape: tuple[int, int], grain: float) -> np.ndarray:
+    random = np.random.default_rng(seed).uniform(-1, 1, (*shape, 3)).astype(np.float32)
+    blurred = cv2.GaussianBlur(random, (0, 0), grain)
+    return (128 + 60 / blurred.std() * blurred).clip(0, 255).astype(np.uint8)
+
+
+def a_shot(turn: float, step: float, person: tuple[float, float]) -> tuple[Shot, np.ndarray]:
+    """A camera that stands so many metres ahead, with a picture of a person at metres right and ahead of the start, and
+    where it shows that."""
+    c, s = np.cos(turn), np.sin(turn)
+    ahead = person[1] - step
+    right, depth = c * person[0] - s * ahead, s * person[0] + c * ahead
+    column, foot = 100 + FOCAL * right / depth, 40 + FOCAL * HEIGHT / depth
+    tall, wide = 1.7 * FOCAL / depth, 0.5 * FOCAL / depth
+    x, y = np.meshgrid(np.arange(SIZE[1]) + 0.5, np.arange(SIZE[0]) + 0.5)
+    u, v = (x - column) / wide + 0.5, (y - foot) / tall + 1
+    shown = (u > 0) & (u < 1) & (v > 0) & (v < 1)
+    color = texture(7, SIZE, 2.0)
+    picture = cv2.remap(
+        texture(1, (90, 30), 3.0), (30 * u - 0.5).astype(np.float32), (90 * v - 0.5).astype(np.float32),
+        cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    color[shown] = picture[shown]
+    pose = np.array([[c, 0, -s, 0], [0, 1, 0, 0], [s, 0, c, -step]], float)
+    view = View(
+        cv2.cvtColor(color, cv2.COLOR_BGR2GRAY), np.array([FOCAL, FOCAL, 100.0, 40.0]), pose, np.ones(SIZE, bool)
+    )
+    ground = np.maximum((y - 40) / FOCAL / HEIGHT, 0).astype(np.float32)
+    return Shot(view, color, Depth(ground, 0.01 * ground), ground), shown
+
+
+def seen(places, masked, turns=TURNS):
+    """What is followed to three images from those that are masked, and the truth."""
+    pairs = [a_shot(turn, k * STEP, place) for k, (turn, place) in enumerate(zip(turns, places, strict=True))]
+    truth = [shown for _, shown in pairs]
+    masks = [t if k in masked else np.zeros(SIZE, bool) for k, t in enumerate(truth)]
+    with ThreadPoolExecutor(1) as pool:
+        parts = upright_objects([shot for shot, _ in pairs], [[1, 2], [0, 2], [1, 0]], masks, pool)
+    return parts, truth
+
+
+AHEAD = [(0.3, 6.0), (0.3, 7.0), (0.3, 8.0)]
+STANDS = [(0.3, 8.0)] * 3
+
+
+@pytest.mark.parametrize("hidden", [0, 1])
+def test_somebody_ahead_is_followed_to_an_image_that_is_turned(hidden):
+    parts, truth = seen(AHEAD, {0, 1, 2} - {hidden})
+    assert parts[hidden][truth[hidden]].mean() > 0.5 and not parts[hidden][~truth[hidden]].any()
+
+
+@pytest.mark.parametrize(("turn", "followed"), [(0.04, False), (0.06, True)], ids=["2 degrees", "3 degrees"])
+def test_somebody_ahead_is_followed_only_where_the_camera_turns(turn, followed):
+    parts, _ = seen(AHEAD, {0, 2}, (0.0, turn, 0.0))
+    assert parts[1].any() == followed
+
+
+def test_what_is_masked_in_one_image_only_is_not_followed():
+    parts, _ = seen(AHEAD, {1})
+    assert not any(part.any() for part in parts)
+
+
+def test_somebody_who_stands_is_not_followed():
+    parts, _ = seen(STANDS, {0, 1})
+    assert not any(part.any() for part in parts)
+
+
+def test_nothing_is_followed_where_nothing_moves():
+    parts, _ = seen(AHEAD, set())
+    assert not any(part.any() for part in parts)
