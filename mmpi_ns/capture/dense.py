@@ -258,17 +258,8 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     assert depth is not None
     if surfaces is None:
         return depth
-    return filled(depth, *surfaces.without_edges().enlarged(view.gray.shape))
-
-
-def filled(depth: Depth, inverse: Map, error: Map) -> Depth:
-    """Measured depths, and others [h, w] where there are none, unless one measured nearby differs, as at an edge."""
-    kernel, is_measured = np.ones((EDGE, EDGE), np.uint8), depth.inverse > 0
-    nearest = cv2.dilate(depth.inverse, kernel)
-    farthest = cv2.erode(np.where(is_measured, depth.inverse, 1e30).astype(np.float32), kernel)
-    fits = (nearest < STEP * inverse) & (inverse < STEP * farthest)
-    taken = np.where(fits, inverse, 0), np.where(fits, error, 0)
-    return Depth(*(np.where(is_measured, a, b) for a, b in zip((depth.inverse, depth.error), taken, strict=True)))
+    is_measured, (inverse, error) = depth.inverse > 0, surfaces.without_edges().enlarged(view.gray.shape)
+    return Depth(np.where(is_measured, depth.inverse, inverse), np.where(is_measured, depth.error, error))
 
 
 def pulled(rough: Map, depth: Depth) -> Map:

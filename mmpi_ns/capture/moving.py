@@ -20,7 +20,7 @@ from rich.progress import track
 
 from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
+from mmpi_ns.capture.dense import Depth, Progress, find_depths
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
 from mmpi_ns.capture.moving_follow import upright_objects
 from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
@@ -28,7 +28,7 @@ from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
-from mmpi_ns.capture.views import View, look_up, straightened, straightened_color
+from mmpi_ns.capture.views import Parallax, View, look_up, straightened, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import duration

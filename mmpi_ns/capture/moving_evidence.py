@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import Depth, Parallax
-from mmpi_ns.capture.views import Map, View, pixel_grid
+from mmpi_ns.capture.dense import Depth
+from mmpi_ns.capture.views import Map, Parallax, View, pixel_grid
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

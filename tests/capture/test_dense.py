@@ -12,7 +12,7 @@ from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
 from mmpi_ns.capture import dense
-from mmpi_ns.capture.dense import Depth, confirmed, filled, find_depths, fuse, without_fringes
+from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, without_fringes
 from mmpi_ns.capture.views import View, camera_matrix, load_view, look_up, project
 
 F32 = np.float32
@@ -118,22 +118,6 @@ def test_without_points_nothing_false_is_believed(tmp_path):
     found = list(find_depths(images, lambda i: np.zeros((0, 3)), WIDTH))
     error, _ = relative_errors(found, POSES)
     assert not len(error) or (error > 0.1).mean() < 0.05
-
-
-def test_gaps_are_filled_but_not_at_edges():
-    """Measured: 1 on the left, 2 on the right, nothing between; the filling fits what is left of the middle."""
-    inverse = np.zeros((20, 40), F32)
-    inverse[:, :10], inverse[:, 30:] = 1, 2
-    measured, filling = Depth(inverse, 0.1 * inverse), np.full((20, 40), 1.05, F32)
-    filling[:2] = 0
-    result = filled(measured, filling, 0.2 * filling)
-    assert (result.inverse[2:, 10:26] == F32(1.05)).all()  # what is on the left is within a tenth
-    assert not result.inverse[2:, 26:30].any() and not result.inverse[:2, 10:30].any()
-    assert (result.inverse[:, :10] == 1).all() and (result.inverse[:, 30:] == 2).all()
-    assert ((result.error > 0) == (result.inverse > 0)).all()
-    assert (result.error[2:, 10:26] == F32(0.2) * F32(1.05)).all() and (result.error[:, 30:] == F32(0.1) * 2).all()
-    nothing = Depth(0 * inverse, 0 * inverse)
-    assert (filled(nothing, filling, filling).inverse == filling).all()
 
 
 def test_a_wall_without_texture_has_no_depth(tmp_path):

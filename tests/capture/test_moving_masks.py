@@ -14,7 +14,7 @@ from training_runs import datamanager
 
 from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
-from mmpi_ns.capture.dense import Depth, Parallax
+from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving import find_moving, gain_of, in_image
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import (
@@ -29,7 +29,7 @@ from mmpi_ns.capture.moving_objects import (
     without_holes,
 )
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import View, camera_matrix
+from mmpi_ns.capture.views import Parallax, View, camera_matrix
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 from mmpi_scene.movers import MOVER, with_movers
