@@ -93,7 +93,7 @@ def test_a_person_is_masked_unless_its_depth_explains_it(tmp_path, is_static):
     people = people_in(images, 0, view, UP)
     color = np.asarray(straightened_color(images, 0, view), np.uint8)
     shot = Shot(view, color, Depth(inverse, 0.01 * inverse), None, None, people)
-    mask = grown(shot, Evidence(nothing, nothing, nothing, 0.0), nothing > 0)
+    mask = grown(shot, Evidence(nothing, nothing, nothing, nothing == 0, 0.0), nothing > 0)
     truth = view.gray < 90
     if is_static:
         assert not mask.any()
