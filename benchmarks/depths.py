@@ -23,9 +23,9 @@ from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 
 CAPTURES = {
-    "walk, 60 images": ("walk", 60, 960, 540),
-    "walk, 20 images": ("walk", 20, 960, 540),
-    "walk, 12 images": ("walk", 12, 960, 540),
+    "walk, 60 images": ("walk", 60, 480, 270),
+    "walk, 20 images": ("walk", 20, 480, 270),
+    "walk, 12 images": ("walk", 12, 480, 270),
     "street, 48 images": ("street", 48, 620, 188),
     "street, 16 images": ("street", 16, 620, 188),
 }
