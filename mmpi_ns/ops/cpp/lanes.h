@@ -1,5 +1,6 @@
 // Sixteen floats at once (GCC's and Clang's vector extension), and the functions of them that the kernels need.
 #pragma once
+#include <cmath>
 #include <cstdint>
 
 typedef float Lanes __attribute__((vector_size(64)));
@@ -65,6 +66,13 @@ inline Lanes load(const float* from) {
     Lanes x;
     __builtin_memcpy(&x, from, sizeof x);
     return x;
+}
+
+inline Lanes root(Lanes x) {
+    float each[WIDTH];
+    __builtin_memcpy(each, &x, sizeof each);
+    for (float& number : each) number = std::sqrt(number);
+    return load(each);
 }
 
 inline void store(float* to, Lanes x) { __builtin_memcpy(to, &x, sizeof x); }

@@ -30,13 +30,6 @@ Mask some(const bool* from, int64_t count) {
     return where;
 }
 
-Lanes root(Lanes x) {
-    float each[WIDTH];
-    std::memcpy(each, &x, sizeof each);
-    for (float& number : each) number = std::sqrt(number);
-    return load(each);
-}
-
 // The three parts of a = linear (x, y, 1) at sixteen pixels of a row.
 struct Linear {
     Lanes a[3];

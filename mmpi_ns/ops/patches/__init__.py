@@ -140,7 +140,7 @@ class _References:
         steps = torch.arange(-REACH, REACH + 1) * stride
         rows, columns = ((torch.arange(n)[:, None] + steps).clamp(0, n - 1) for n in (height, width))
         values = gray[rows[:, None, :, None], columns[None, :, None, :]].float().flatten(2)
-        self.gray, self.steps = gray, steps
+        self.steps = steps
         self.values = values - values.mean(-1, keepdim=True)
         """[H, W, 25]"""
         self.squares = self.values.square().sum(-1)

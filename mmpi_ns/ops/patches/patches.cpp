@@ -15,13 +15,6 @@ namespace {
 constexpr int REACH = 2, SIDE = 2 * REACH + 1, PIXELS = SIDE * SIDE, LEVELS = 3; // as in __init__.py
 constexpr float LEAST_AHEAD = 1e-6f, LEAST_SHARE = 0.2f, LEAST_SQUARES = PIXELS, UNSEEN = 0.4f, GRAZING = 0.05f;
 
-Lanes root(Lanes x) {
-    float each[WIDTH];
-    std::memcpy(each, &x, sizeof each);
-    for (float& number : each) number = std::sqrt(number);
-    return load(each);
-}
-
 struct Plane {
     Lanes q, right, down;
 };
