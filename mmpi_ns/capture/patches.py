@@ -169,8 +169,8 @@ def _certain(view: View, others: Sequence[View], patches: Patches) -> Surfaces:
 
 
 def _parallax(view: View, others: Sequence[View], inverse: Map) -> Map:
-    """Pixels of motion for each unit of inverse depth in the second best of the other views, or in the only one.
-    [h, w]"""
+    """Pixels of motion for each unit of inverse depth in the second best of the other views that show it, or in the one
+    that does. [h, w]"""
     change = np.maximum(1e-3 * inverse, 1e-12)
     best, second = np.zeros((2, *inverse.shape), np.float32)
     for other in others:
@@ -182,4 +182,4 @@ def _parallax(view: View, others: Sequence[View], inverse: Map) -> Map:
         moved = np.where(shown, np.hypot(moved_x - x, moved_y - y) / change, 0)
         second = np.maximum(second, np.minimum(best, moved))
         best = np.maximum(best, moved)
-    return second if len(others) > 1 else best
+    return np.where(second > 0, second, best)

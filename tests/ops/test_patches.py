@@ -9,7 +9,7 @@ import torch
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.patches import Others, Patches, compare_planes, others_of, spread_planes
 
-HEIGHT, WIDTH, STRIDE, UNSEEN = 18, 37, 2, 0.4
+HEIGHT, WIDTH, STRIDE, ALONE = 18, 37, 2, 0.1
 PINHOLE = np.array([40.0, 44.0, 17.0, 8.0])
 
 
@@ -117,7 +117,8 @@ def alike(gray, grays, linear, b, row, column, plane):
         return np.nan
     if all(c is None for c in each):
         return -1.0
-    best = sorted(UNSEEN if c is None else c for c in each)[-2:]
+    seen = [c for c in each if c is not None]
+    best = sorted([*seen, *[max(max(seen) - ALONE, -1)] * (len(each) - len(seen))])[-2:]
     return sum(best) / len(best)
 
 

@@ -26,8 +26,8 @@ LEAST_AHEAD, LEAST_SHARE = 1e-6, 0.2
 """Depth there over depth here, at least, and of a patch's pixels over that of its middle."""
 LEAST_CONTRAST = 1.0
 """Standard deviation of gray levels of a patch, at least."""
-UNSEEN = 0.4
-"""Correlation with an image that does not show the patch."""
+ALONE = 0.1
+"""How much less than the best correlation one with an image that does not show the patch counts as."""
 OFFSETS = (1, 4, 2)
 """Pixels from which planes spread, in turn."""
 GRAZING = 0.05
@@ -53,8 +53,8 @@ class Patches(NamedTuple):
     planes: Float[Tensor, "H W 3"]
     """Inverse depth at the pixel's centre, and its change for a pixel to the right and for one down."""
     alike: Float[Tensor, "H W"]
-    """Mean of the two largest correlations (with one image: that), ``UNSEEN`` for images that do not show the patch;
-    -1 where none does."""
+    """Mean of the two largest correlations (with one image: that), the largest less ``ALONE`` for images that do not
+    show the patch; -1 where none does."""
 
 
 @operation()
@@ -148,12 +148,15 @@ class _References:
 
 def _better(references: _References, patches: Patches, planes: Tensor, others: Others) -> Patches:
     best, second = (torch.full(planes.shape[:2], -1.0, dtype=planes.dtype) for _ in range(2))
-    is_shown = torch.zeros(planes.shape[:2], dtype=torch.bool)
+    is_shown, is_hidden = torch.zeros((2, *planes.shape[:2]), dtype=torch.bool)
     for sizes, linear, b in zip(others.levels, others.linear, others.b, strict=True):
         alike, shown = _correlations(references, planes, others.corners, sizes, linear, b)
         second = torch.maximum(second, torch.minimum(best, alike))
-        best, is_shown = torch.maximum(best, alike), is_shown | shown
-    second = best if len(others.b) == 1 else second
+        best, is_shown, is_hidden = torch.maximum(best, alike), is_shown | shown, is_hidden | ~shown
+    if len(others.b) == 1:
+        second = best
+    else:
+        second = torch.where(is_hidden, torch.maximum(second, best - ALONE), second)
     flat = references.squares < LEAST_CONTRAST**2 * references.values.shape[-1]
     mean = torch.where(is_shown & ~flat & (planes[..., 0] > 0), (best + second) / 2, -1.0)
     better = mean > patches.alike
@@ -163,7 +166,7 @@ def _better(references: _References, patches: Patches, planes: Tensor, others: O
 def _correlations(
     references: _References, planes: Tensor, corners: Tensor, sizes: Tensor, linear: Tensor, b: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Correlations of patches with one image, and whether it shows their middles. [H, W] each"""
+    """Correlations of patches with one image (-1: none), and whether it shows their middles. [H, W] each"""
     x, y = _centers(planes)
     q, right, down = planes.unbind(-1)
     middle = torch.stack([m[0] * x + (m[1] * y + m[2]) + q * s for m, s in zip(linear, b, strict=True)])
@@ -197,8 +200,7 @@ def _correlations(
     values = values - values.mean(-1, keepdim=True)
     squares = values.square().sum(-1)
     alike = (values * references.values).sum(-1) / (squares * references.squares).clamp(min=1e-20).sqrt()
-    alike = torch.where(whole & (squares >= LEAST_CONTRAST**2 * values.shape[-1]), alike, -1.0)
-    return torch.where(shown, alike, UNSEEN), shown
+    return torch.where(shown & whole & (squares >= LEAST_CONTRAST**2 * values.shape[-1]), alike, -1.0), shown
 
 
 def others_of(

@@ -13,7 +13,7 @@
 namespace {
 
 constexpr int REACH = 2, SIDE = 2 * REACH + 1, PIXELS = SIDE * SIDE, LEVELS = 3; // as in __init__.py
-constexpr float LEAST_AHEAD = 1e-6f, LEAST_SHARE = 0.2f, LEAST_SQUARES = PIXELS, UNSEEN = 0.4f, GRAZING = 0.05f;
+constexpr float LEAST_AHEAD = 1e-6f, LEAST_SHARE = 0.2f, LEAST_SQUARES = PIXELS, ALONE = 0.1f, GRAZING = 0.05f;
 
 struct Plane {
     Lanes q, right, down;
@@ -46,9 +46,9 @@ struct Other {
     const float* linear;
     const float* b;
 
-    // Correlations with sixteen patches whose values less their means are given; UNSEEN where it does not show them.
+    // Correlations with sixteen patches whose values less their means are given; -1 where it does not show them.
     Lanes alike(const Lanes* values, Lanes squares, Lanes x, float y, const Plane& plane, float stride,
-                Mask& is_shown) const {
+                Mask& shown) const {
         Lanes middle[3], right[3], down[3];
         for (int i = 0; i < 3; i++) {
             const float* m = linear + 3 * i;
@@ -59,9 +59,8 @@ struct Other {
         const Mask ahead = middle[2] > LEAST_AHEAD;
         const Lanes over = 1.0f / pick(ahead, middle[2], splat(1)), column = middle[0] * over, row = middle[1] * over;
         const float height = sizes[4], width = sizes[5];
-        const Mask shown = ahead & (column >= 0.5f) & (column <= width - 0.5f) & (row >= 0.5f) & (row <= height - 0.5f);
-        if (!any(shown)) return splat(UNSEEN);
-        is_shown |= shown;
+        shown = ahead & (column >= 0.5f) & (column <= width - 0.5f) & (row >= 0.5f) & (row <= height - 0.5f);
+        if (!any(shown)) return splat(-1);
         // Pixels there for a pixel here decide the size at which the image is looked at.
         const Lanes xr = right[0] - column * right[2], yr = right[1] - row * right[2];
         const Lanes xd = down[0] - column * down[2], yd = down[1] - row * down[2];
@@ -96,7 +95,7 @@ struct Other {
         }
         const Lanes correlation = product / root(most(their_squares * squares, splat(1e-20f)));
         const Mask counts = (nearest >= LEAST_SHARE * middle[2]) & (their_squares >= LEAST_SQUARES);
-        return pick(shown, pick(counts, correlation, splat(-1)), splat(UNSEEN));
+        return pick(shown & counts, correlation, splat(-1));
     }
 };
 
@@ -157,14 +156,18 @@ struct Pixels {
         counts &= (plane.q > 0) & (squares >= LEAST_SQUARES);
         if (!any(counts)) return;
         Lanes first = splat(-1), second = splat(-1);
-        Mask is_shown{};
+        Mask is_shown{}, is_hidden{};
         for (int64_t k = 0; k < of.count; k++) {
             const Other other{of.corners, of.sizes + 3 * LEVELS * k, of.linear + 9 * k, of.b + 3 * k};
-            const Lanes one = other.alike(values, squares, x, y, plane, of.stride, is_shown);
+            Mask shown;
+            const Lanes one = other.alike(values, squares, x, y, plane, of.stride, shown);
+            is_shown |= shown;
+            is_hidden |= ~shown;
             second = most(second, least(first, one));
             first = most(first, one);
         }
-        const Lanes mean = of.count == 1 ? first : (first + second) * 0.5f;
+        second = of.count == 1 ? first : pick(is_hidden, most(second, first - ALONE), second);
+        const Lanes mean = (first + second) * 0.5f;
         const Mask better = counts & is_shown & (mean > alike);
         alike = pick(better, mean, alike);
         best = {pick(better, plane.q, best.q), pick(better, plane.right, best.right),
