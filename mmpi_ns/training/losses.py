@@ -145,12 +145,13 @@ def batch_losses(
     # If MPIs train separately and cover a ray only in part, they need not explain the remaining transmittance.
     explained = rays.report.explained[pixels]
     background = torch.where(explained, random, observed)
-    colors, transmittance = rays.colors.of_rays(pixels), rays.composite.transmittance.index_select(0, pixels)
-    rgb = colors.rgb + transmittance * background
+    shown = (rays.colors.rgb, rays.colors.mass, rays.colors.first, rays.colors.second, rays.composite.transmittance)
+    colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in shown)
+    rgb = colors + transmittance * background
     sums = _depth_sums(rays, field)
     total = {
         "rgb_loss": photometric(rgb, observed, None if exposure is None else exposure.index_select(0, pixels)),
-        "point_color": weight.point_color * point_color(colors.mass, colors.first, colors.second, observed),
+        "point_color": weight.point_color * point_color(mass, first, second, observed),
         "entropy": weight.background_entropy * background_entropy(transmittance),
         "distortion": weight.distortion * sums.spread.index_select(0, pixels).mean(),
     }

@@ -36,7 +36,7 @@ from mmpi_ns.training.checkpoints import (
 )
 from mmpi_ns.training.learning_rates import PhaseScheduler
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.options import check_device, check_nothing_left, check_run
+from mmpi_ns.training.options import check_nothing_left, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
@@ -127,7 +127,6 @@ class MMPITrainer(Trainer):
         # Images are shared among threads; those of the libraries would only spin between small operations.
         with signals_go_to(_end) if self.world_size == 1 else nullcontext(), one_thread_each():
             enter_command(training=True)
-            check_device(self.config.machine.device_type)
             if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
                 torch.cuda.set_device(self.local_rank)
             self._stopped_by: int | None = None
@@ -178,8 +177,12 @@ class MMPITrainer(Trainer):
 
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
-        say(self._manager.describe())
-        say(describe(plan, self._window_steps, *self._expected_memory()))
+        run, manager, windows = self._run, self._manager, plan.windows
+        work = Work(run.field.feature_channels, any(phase.name == "blend" for phase in run.progress.schedule.phases))
+        tables = [training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows]
+        cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
+        say(manager.describe())
+        say(describe(plan, self._window_steps, tables, [manager.pixel_bytes(c) for c in cameras]))
         if self._follows_capture:
             rays, times = self._manager.config.train_num_rays_per_batch, self.config.pipeline.model.rays_times  # type: ignore[attr-defined]
             say(
@@ -192,15 +195,6 @@ class MMPITrainer(Trainer):
             say(forecast(self.config.method_name or "", self._total_steps, rays, num_threads(), free_cores()))
             if gpu := unused_gpu():
                 say(f"No GPU is used: {gpu}.")
-
-    def _expected_memory(self) -> tuple[list[int], list[int]]:
-        """Bytes needed for training each window: tables with their moments, and pixels."""
-        run, manager, windows = self._run, self._manager, self._run.progress.windows.windows
-        blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
-        work = Work(run.field.feature_channels, blends)
-        tables = [training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows]
-        cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
-        return tables, [manager.pixel_bytes(c) for c in cameras]
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that follow the phases."""
@@ -227,7 +221,6 @@ class MMPITrainer(Trainer):
         if self._share is not None:
             for window in self._share.unfinished(self._run.progress, self._run.store):
                 self.train_window(window)
-            self._share.wait_for_all()
             if self._share.rank == 0:
                 self._write_details(self._total_steps - 1)
             return
