@@ -229,9 +229,8 @@ class MMPIField(TexelTables):
         if not isinstance(self.networks, RayShader):
             lookup = lookup if lookup is None or chosen is None else lookup.of_rays(chosen)
             colors = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]
-            weights = composite.weights.detach()[..., None]
-            first, second = (weights * colors).sum(1), (weights * colors**2).sum(1)
-            return RayColors(render_colors(composite, colors), weights.sum(1), first, second)
+            rgb, weights = render_colors(composite, colors), composite.weights.detach()[..., None]
+            return RayColors(rgb, weights.sum(1), (weights * colors).sum(1), (weights * colors**2).sum(1))
         if lookup is None:
             sums = gather_places(self.layout, self.features.data, places_of(ray_samples), composite.weights)
         else:
