@@ -342,8 +342,8 @@ def split_codes(
 
 
 def coarse_differences(coarse: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Stored form [C, 16, B] of coarse codes [C, B, 4, 4]: differences along rows and columns, of first texels along
-    bricks."""
+    """Coarse codes [C, B, 4, 4] as they are stored [C, 16, B]: differences along rows and columns, and along bricks for
+    the first texels."""
     stored = np.diff(np.diff(coarse, axis=3, prepend=np.uint8(0)), axis=2, prepend=np.uint8(0))
     stored[:, :, 0, 0] = np.diff(stored[:, :, 0, 0], prepend=np.uint8(0))
     return stored.reshape(*coarse.shape[:2], -1).swapaxes(1, 2)

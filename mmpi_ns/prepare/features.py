@@ -76,9 +76,9 @@ def extract(
     threads: int,
     folder: Path,
 ) -> None:
-    """A folder's database with the cameras (number of each image's, and all of them) and SIFT features of all images;
-    images that have theirs are skipped.
+    """SIFT features of all images, in the database of a folder; images that have theirs are skipped.
 
+    The database is made if it is missing, with ``cameras``: the number of each image's, and the cameras themselves.
     Weak features count too if most of a sample of the images have less than half of the features that they may have.
     Raises InputError if an image cannot be read, or hardly any has features.
     """
