@@ -120,6 +120,15 @@ def check_nothing_left(model: Any) -> None:
                 )
 
 
+def check_device(device_type: str) -> None:
+    """Raises InputError if training is to run on a GPU that torch does not see."""
+    if device_type == "cuda" and not torch.cuda.is_available():
+        raise InputError(
+            "--machine.device-type cuda asks for a GPU, and torch sees none: "
+            f"{unused_gpu() or 'check the driver and the build of torch'}; --machine.device-type cpu trains without."
+        )
+
+
 def check_run(config: TrainerConfig) -> None:
     """Raises InputError naming the option that cannot be used, or that would be ignored."""
     manager: Any = config.pipeline.datamanager
@@ -154,11 +163,6 @@ def check_run(config: TrainerConfig) -> None:
         raise InputError(
             f"--machine.num-devices {processes} asks for as many GPUs and torch sees {torch.cuda.device_count()}: give "
             f"fewer, or train on CPUs with torchrun --nproc-per-node {processes} -m mmpi_ns.scripts.train."
-        )
-    if config.machine.device_type == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            "--machine.device-type cuda asks for a GPU, and torch sees none: "
-            f"{unused_gpu() or 'check the driver and the build of torch'}; --machine.device-type cpu trains without."
         )
     if config.machine.device_type == "mps":
         raise InputError("--machine.device-type mps has no compiled operations: use cpu.")
