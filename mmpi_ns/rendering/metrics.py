@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -21,13 +22,13 @@ WINDOW = 11
 """Side of SSIM's window, pixels."""
 
 
+@dataclass(eq=False)
 class ImageMetrics:
     """Metrics of a rendered image. LPIPS downloads its weights on first use and is left out without them."""
 
-    def __init__(self, lpips_net: Literal["vgg", "alex", "none"]) -> None:
-        self.lpips_net: Literal["vgg", "alex", "none"] = lpips_net
-        self._lpips: nn.Module | None = None
-        self._lpips_tried = False
+    lpips_net: Literal["vgg", "alex", "none"]
+    _lpips: nn.Module | None = None
+    _lpips_tried: bool = False
 
     @torch.no_grad()
     def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
