@@ -118,7 +118,8 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
     bundle = bounded(bundle, field.plan)
 
     def sample():
-        return model.sampler(bundle, field=field, **model.training_bounds())
+        forming = not model.progress.schedule.sharpened(model.progress.step)
+        return model.sampler(bundle, field=field, **model.config.sampling.bounds(field.plan, forming))
 
     samples, report = sample()
     lookup = field._lookup(samples)

@@ -15,9 +15,9 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 
-from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.export.bake import read_run_config
-from mmpi_ns.export.files import HEADER, BakedScene, read_baked
+from mmpi_ns.export.files import HEADER, read_baked
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
 from mmpi_ns.utils.errors import InputError
@@ -84,41 +84,30 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     folder = path.parent if path.is_file() else path
     if (folder / HEADER).is_file():
-        return _load_baked(read_baked(folder), device)
-    if (folder / "config.yml").is_file():
-        return _load_run(folder / "config.yml", device)
-    raise InputError(
-        f"There is no scene at {path}: give the folder of a run (with config.yml), or one that mmpi-export bake or "
-        f"mmpi-export web wrote (with {HEADER})."
-    )
-
-
-def _load_run(config_path: Path, device: torch.device) -> Scene:
-    """The model of a run with its last checkpoint, without a data manager."""
-    config = read_run_config(config_path)
-    state = read_checkpoint(last_checkpoint(config_path.parent / "nerfstudio_models"))
+        baked = read_baked(folder)
+        lenses = torch.tensor([(*pose.focal, *pose.center) for pose in baked.path])
+        poses, sizes = torch.tensor([pose.to_world for pose in baked.path]), torch.tensor([p.size for p in baked.path])
+        names = WindowedPlan(tuple(place for place, _ in baked.windows)).names
+        views = CameraPath(poses, _intrinsics(lenses), sizes)
+        return Scene(names, views, device, lambda camera: baked.image(image_rays(camera.to("cpu"))))
+    if not (folder / "config.yml").is_file():
+        raise InputError(
+            f"There is no scene at {path}: give the folder of a run (with config.yml), or one that mmpi-export bake or "
+            f"mmpi-export web wrote (with {HEADER})."
+        )
+    # The model of a run with its last checkpoint, without a data manager.
+    config = read_run_config(folder / "config.yml")
+    state = read_checkpoint(last_checkpoint(folder / "nerfstudio_models"))
     cameras = state["capture"]["cameras"]
-    config.windows_folder, config.rendering.mode = config_path.parent / "windows", "exact"
+    config.windows_folder, config.rendering.mode = folder / "windows", "exact"
     unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
     tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
     model.load_state_dict(tensors)
     model.update_to_step(state["step"])
     model.eval()
-    path = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(cameras[:, 12:16]), cameras[:, 16:].long())
-    return Scene(model.progress.windows.names, path, device, model.get_outputs_for_camera)
-
-
-def _load_baked(baked: BakedScene, device: torch.device) -> Scene:
-    def render_image(camera: Cameras) -> dict[str, Tensor]:
-        rays = PinholeRays.of(camera, "cpu")
-        assert rays is not None
-        return baked.image(rays.image(int(camera.height), int(camera.width)))
-
-    numbers = torch.tensor([(*pose.focal, *pose.center) for pose in baked.path])
-    poses, sizes = torch.tensor([pose.to_world for pose in baked.path]), torch.tensor([p.size for p in baked.path])
-    names = WindowedPlan(tuple(place for place, _ in baked.windows)).names
-    return Scene(names, CameraPath(poses, _intrinsics(numbers), sizes), device, render_image)
+    views = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(cameras[:, 12:16]), cameras[:, 16:].long())
+    return Scene(model.progress.windows.names, views, device, model.get_outputs_for_camera)
 
 
 def _intrinsics(numbers: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:

@@ -33,7 +33,7 @@ from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
-from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures, psnr_and_ssim
+from mmpi_ns.rendering.metrics import ImageMetrics, image_scores, pictures
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
     RenderedRays,
@@ -54,13 +54,10 @@ from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, 
 from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import TRAINS, ScheduleConfig, make_schedule
-from mmpi_ns.training.run import Progress, TrainingRun, individual_rays, move_rays, views_of
+from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
-
-FAIR_SHARE = 0.1
-"""While the resolution grows, samples with more than this fraction of an equal weight are kept."""
 
 
 @dataclass
@@ -216,26 +213,24 @@ class MMPIModel(Model):
         """Outputs of an image's rays; ``RenderedRays`` for the losses of a training batch, of the window at hand."""
         if not self.training:
             return self.image_outputs(ray_bundle)
-        progress, field, bundle = self.progress, self.field, ray_bundle
-        asked, head_mask, choose = len(bundle), None, None
+        progress, field, bundle, asked = self.progress, self.field, ray_bundle, len(ray_bundle)
+        head_mask, choose, num_mpis = None, None, len(field.plan.mpis)
         move_rays(bundle, self.camera_optimizer)
         bundle = bounded(bundle, field.plan)
-        if progress.phase.name == "individual":
-            g = generator(self.config.seed, progress.step, "assignment", self.device)
-            bundle, head_mask, choose = individual_rays(bundle, field.plan, self.config.schedule.rays_per_mpi, g)
+        if progress.phase.name == "individual" and num_mpis > 1:
+            # Rays for one of the MPIs that they meet, or for every MPI in turn, and for the cube (paper sec. III-C).
+            if self.config.schedule.rays_per_mpi == "split":
+                g = generator(self.config.seed, progress.step, "assignment", self.device)
+                choose = torch.rand(asked, num_mpis, generator=g, device=self.device)
+            else:
+                heads = torch.arange(num_mpis, device=self.device).repeat_interleave(asked)
+                head_mask = torch.arange(field.plan.num_heads, device=self.device) == heads[:, None]
+                head_mask[:, num_mpis:].fill_(True)
+                bundle = bundle.broadcast_to((num_mpis, asked)).flatten()
         blends = "reliability" in TRAINS[progress.phase.name] and self.blends(field)
-        sampling = {"head_mask": head_mask, "choose": choose, **self.training_bounds()}
-        rays = render_rays(self.sampler, bundle, field, blends=blends, **sampling)
+        bounds = self.config.sampling.bounds(field.plan, forming=not progress.schedule.sharpened(progress.step))
+        rays = render_rays(self.sampler, bundle, field, blends=blends, head_mask=head_mask, choose=choose, **bounds)
         return {"training": replace(rays, times=len(bundle) // asked)}
-
-    def training_bounds(self) -> dict[str, float]:
-        """Minimum weights of samples kept in training (``ops.march.prune``).
-
-        While surfaces form, samples of little weight must learn too, and the cube starts nearly empty.
-        """
-        sampling, forming = self.config.sampling, not self.progress.schedule.sharpened(self.progress.step)
-        cube = 0.1 * sampling.cube_alpha if forming and self.field.plan.cube is not None else float("inf")
-        return {"threshold": min(sampling.threshold, cube), "fair_share": FAIR_SHARE if forming else float("inf")}
 
     def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:
         """rgb, accumulation, depth, winning MPI, pixels of its texels and dropped mass [R, .] of rays, from the windows
@@ -271,7 +266,7 @@ class MMPIModel(Model):
             bundle: the rays.
             chosen: the one (window, head) to show; None for all.
         """
-        mode, first_head = self.config.rendering.mode, self.progress.windows.first_head(window)
+        mode, first_head = self.config.rendering.mode, sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
         may_bake = mode == "auto" and not self.trains and one_exposure
@@ -396,12 +391,7 @@ class MMPIModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics of an image, and pictures of it."""
         observed = self.observed(batch).to(outputs["rgb"].device)
-        values = self.metrics(outputs["rgb"], observed)
-        if "field_rgb" in outputs:
-            values |= {f"field_{name}": value for name, value in psnr_and_ssim(outputs["field_rgb"], observed).items()}
-        values["dropped_mass"] = float(outputs["dropped_mass"].mean())
-        if "distance" in batch:
-            values |= depth_metrics(outputs["depth"], batch["distance"].to(outputs["depth"]))
+        values = image_scores(self.metrics, outputs, observed, batch.get("distance"))
         return values, pictures(observed, outputs, len(self.progress.windows.names))
 
     def observed(self, batch: dict[str, Tensor]) -> Tensor:

@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from torch import Tensor
 
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
@@ -64,10 +63,20 @@ class Score:
         metrics = ImageMetrics(self.lpips)
         scores: Scores = []
         for i, file in zip(chosen, files, strict=True):
-            truth = truths.get_data(i)["image"]
+            truth, name = truths.get_data(i)["image"], truths.image_filenames[i]
             if truth.shape[-1] != 3:
-                raise ValueError(f"{truths.image_filenames[i]} is see-through: there is no one truth to compare with.")
-            scores.append((truths.image_filenames[i].name, metrics(read_rendering(truths, file, truth), truth)))
+                raise ValueError(f"{name} is see-through: there is no one truth to compare with.")
+            pixels = MMPIDataset(replace(truths._dataparser_outputs, image_filenames=[file])).get_numpy_image(0)
+            if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:
+                raise ValueError(f"{file} is see-through: put it over the background that the test images have.")
+            if pixels.shape[:2] != truth.shape[:2]:
+                (height, width), (high, wide) = pixels.shape[:2], truth.shape[:2]
+                raise ValueError(
+                    f"{file} has {width} x {height} pixels and its test image {wide} x {high}: render at that size, or "
+                    "give the --downscale-factor that was rendered at."
+                )
+            colors = torch.from_numpy(pixels[..., :3].astype(np.float32) / 255)
+            scores.append((name.name, metrics(colors, truth)))
         if min(values["psnr"] for _, values in scores) > SAME_DB:
             raise ValueError(f"{self.images} holds the test images themselves: give the folder of the renderings.")
         means = {k: float(np.mean([values[k] for _, values in scores])) for k in scores[0][1]}
@@ -102,19 +111,3 @@ def find_renderings(folder: Path, tests: list[Path]) -> list[Path]:
         if others:
             raise ValueError(f"{folder} holds {first.name} and {others[0].name}: keep one of them.")
     return [by_name[test.stem][0] for test in tests]
-
-
-def read_rendering(tests: MMPIDataset, file: Path, truth: Tensor) -> Tensor:
-    """The rendering of a test image [H, W, 3], from 0 to 1. Raises ValueError if it cannot be read, is see-through, or
-    is not of the size of the truth [H, W, 3]."""
-    outputs = replace(tests._dataparser_outputs, image_filenames=[file])
-    pixels = MMPIDataset(outputs).get_numpy_image(0)
-    if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:
-        raise ValueError(f"{file} is see-through: put it over the background that the test images have.")
-    (height, width), (high, wide) = pixels.shape[:2], truth.shape[:2]
-    if (height, width) != (high, wide):
-        raise ValueError(
-            f"{file} has {width} x {height} pixels and its test image {wide} x {high}: render at that size, or give "
-            "the --downscale-factor that was rendered at."
-        )
-    return torch.from_numpy(pixels[..., :3].astype(np.float32) / 255)

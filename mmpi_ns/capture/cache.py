@@ -6,6 +6,7 @@ import hashlib
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
@@ -43,19 +44,20 @@ def digest(files: Iterable[Path], *parts: object) -> str:
     return key.hexdigest()[:32]
 
 
+@dataclass(frozen=True, eq=False)
 class Computed(Sequence[T]):
     """Results of a function of 0 to n - 1, computed at every access, so that they take no memory."""
 
-    def __init__(self, count: int, function: Callable[[int], T]) -> None:
-        self._length, self._function = count, function
+    length: int
+    function: Callable[[int], T]
 
     def __len__(self) -> int:
-        return self._length
+        return self.length
 
     def __getitem__(self, i: Any) -> Any:
-        if not 0 <= i < self._length:
+        if not 0 <= i < self.length:
             raise IndexError(i)
-        return self._function(i)
+        return self.function(i)
 
 
 def held(

@@ -29,7 +29,7 @@ from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
 from mmpi_ns.capture.moving import moving_masks, share_of_moving
 from mmpi_ns.capture.moving_picture import draw_moving
 from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
-from mmpi_ns.capture.observe import drop_masked, observe, posed_images, sfm_folder
+from mmpi_ns.capture.observe import drop_masked, observe, posed_images
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
 from mmpi_ns.capture.ray_sources import PixelPool, RaySources, rays_to_keypoints
 from mmpi_ns.capture.rays import PinholeRays
@@ -164,7 +164,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return observe(
             self.train_dataparser_outputs,
             self.train_dataset,
-            sfm_folder(self.dataparser.config, self.config.sfm_path),
+            self.dataparser.config,
+            self.config.sfm_path,
             find_points=self.test_mode == "val",
             triangulates=self.config.triangulate,
         )
@@ -373,5 +374,5 @@ def load_observations(
             draw_moving(moving, zip(names, (np.flip(x.numpy(), -1) for x in colors), strict=True), masks)
         return manager.train_dataset.metadata[OBSERVATIONS], manager.moves
     CONSOLE.print(f"The images of {data} are not there: its cameras and points alone are judged.")
-    folder = sfm_folder(parser_config, config.sfm_path)
-    return observe(outputs, MMPIDataset(outputs), folder, find_points=True, triangulates=config.triangulate), ""
+    cameras = MMPIDataset(outputs), parser_config, config.sfm_path
+    return observe(outputs, *cameras, find_points=True, triangulates=config.triangulate), ""

@@ -60,29 +60,32 @@ FARTHEST = 1e5
 """Distance of a point from the cameras, over their own extent, from which it is a mistake."""
 
 
-def sfm_folder(parser: DataParserConfig, default: Path) -> Path:
-    """Folder of a scene's COLMAP model: the data parser's, otherwise ``default`` beside the frames."""
-    data = Path(parser.data)
-    folder = data.parent if data.suffix == ".json" else data
-    return folder / getattr(parser, "colmap_path", default)
-
-
 def observe(
-    outputs: DataparserOutputs, dataset: MMPIDataset, sfm: Path, *, find_points: bool, triangulates: bool
+    outputs: DataparserOutputs,
+    dataset: MMPIDataset,
+    parser: DataParserConfig,
+    sfm_path: Path,
+    *,
+    find_points: bool,
+    triangulates: bool,
 ) -> Observations:
     """The observations of a training data set.
 
     Args:
         outputs: data parser outputs of the training images.
         dataset: the training images.
-        sfm: folder of a COLMAP model, which need not exist.
+        parser: settings of the data parser, whose COLMAP model is read if it has one.
+        sfm_path: of a COLMAP model beside the frames otherwise; it need not exist.
         find_points: search the images for points if there are no tracks.
         triangulates: match features for this before a plane sweep.
 
     Raises:
         InputError: poses or intrinsics that cannot be used.
     """
-    observations = read_observations(outputs, dataset.cameras, find_sfm_model(sfm))
+    data = Path(parser.data)
+    folder = data.parent if data.suffix == ".json" else data
+    model = find_sfm_model(folder / getattr(parser, "colmap_path", sfm_path))
+    observations = read_observations(outputs, dataset.cameras, model)
     if np.ptp(observations.centers, axis=0).max() <= SAME_PLACE * max(1.0, np.abs(observations.centers).max()):
         CONSOLE.print("[bold yellow]All training cameras stand in one place: no distance can be learned.")
     if find_points:

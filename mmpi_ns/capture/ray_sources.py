@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int16, UInt8
+from jaxtyping import Float, Int, Int16, UInt8
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
@@ -264,11 +264,3 @@ class RaySources:
         if self.exposures is not None:
             metadata[EXPOSURE] = self.exposures[joined["camera_indices"][:, 0]]
         return RayBundle(**joined, metadata=metadata), {"image": colors, "indices": indices}
-
-
-def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:
-    """Marks rays through pixels; rays to SfM keypoints have a known depth but no pixel."""
-    keypoint_depths = bundle.metadata.get(KEYPOINT_DEPTH)
-    if keypoint_depths is None:
-        return torch.ones(len(bundle), dtype=torch.bool, device=bundle.origins.device)
-    return keypoint_depths[:, 0] == 0

@@ -18,7 +18,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.capture.rays import image_rays
-from mmpi_ns.export.details import StoredView, stored_view
+from mmpi_ns.export.details import stored_view
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.rendering.metrics import ImageMetrics
@@ -84,7 +84,12 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         rays = image_rays(cameras[i : i + 1], step).flatten()
         return rays.origins.contiguous(), rays.directions.contiguous()
 
-    views, nearest = _details_of(model)
+    views, nearest = (), 0
+    if (details := model.details) is not None:
+        read, nearest = details.view, model.config.rendering.nearest_images
+        views = tuple(in_order(lambda i: stored_view(read(i, torch.device("cpu"))), range(len(details.cameras))))
+        written = sum(len(v.difference + v.inverse) for v in views)
+        print(f"Details of {len(views)} training images: {written / 1e6:.2f} MB.")
     room = sum(len(v.difference + v.inverse) + VIEW_BYTES for v in views) / BRICK_BYTES / len(places)
     windows = []
     for number, place in enumerate(places):
@@ -113,16 +118,6 @@ def _limit(peaks: Tensor, least: float, bricks: int) -> float:
     if least == 0 or not bricks or not len(seen):
         return least
     return max(least, min(HARDLY, float(seen[min(bricks, len(seen) - 1)])))
-
-
-def _details_of(model: MMPIModel) -> tuple[tuple[StoredView, ...], int]:
-    """Details of a model, as they are written, and the number of training images for each image."""
-    if model.details is None:
-        return (), 0
-    read, numbers = model.details.view, range(len(model.details.cameras))
-    views = tuple(in_order(lambda i: stored_view(read(i, torch.device("cpu"))), numbers))
-    print(f"Details of {len(views)} training images: {sum(len(v.difference + v.inverse) for v in views) / 1e6:.2f} MB.")
-    return views, model.config.rendering.nearest_images
 
 
 def poses_of(pipeline: Any) -> list[Pose]:

@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from mmpi_ns.rendering.details import Details, DetailView
+from mmpi_ns.rendering.details import DetailView
 
 STEP = 1 / 381
 """Of codes of differences: two thirds of a grey level."""
@@ -95,15 +95,3 @@ def _pixels(data: bytes) -> UInt8[NDArray[np.uint8], "H W 3"]:
 
 def cameras_of(views: tuple[StoredView, ...]) -> Float[Tensor, "N 24"]:
     return torch.tensor([view.camera for view in views])
-
-
-def restored_details(views: tuple[StoredView, ...]) -> Details:
-    """Details of a baked scene. Raises ValueError, when an image is needed that is damaged."""
-
-    def read(i: int, device: torch.device) -> DetailView:
-        try:
-            return restored_view(views[i], device)
-        except (OSError, ValueError, SyntaxError) as error:
-            raise ValueError(f"Details of training image {i} are damaged ({error}): bake the scene again.") from error
-
-    return Details(cameras_of(views), read)

@@ -18,15 +18,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.rays import PinholeRays
-from mmpi_ns.export.details import STEP, StoredView, cameras_of, restored_details
+from mmpi_ns.export.details import STEP, StoredView, cameras_of, restored_view
 from mmpi_ns.rendering.baked import BakedWindow
-from mmpi_ns.rendering.details import Details
+from mmpi_ns.rendering.details import Details, DetailView
 from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks, render_windows
 from mmpi_ns.scene.baked import (
     CELLS,
@@ -95,7 +95,17 @@ class BakedScene:
 
     @cached_property
     def details(self) -> Details:
-        return restored_details(self.views)
+        """Those of the training images. Raises ValueError, when an image is needed that is damaged."""
+
+        def read(i: int, device: torch.device) -> DetailView:
+            try:
+                return restored_view(self.views[i], device)
+            except (OSError, ValueError, SyntaxError) as error:
+                raise ValueError(
+                    f"Details of training image {i} are damaged ({error}): bake the scene again."
+                ) from error
+
+        return Details(cameras_of(self.views), read)
 
     def image(self, bundle: RayBundle) -> dict[str, Tensor]:
         """Outputs of an image's rays [H, W], as of the model: with details, where there are some."""
@@ -126,10 +136,13 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / HEADER).unlink(missing_ok=True)
-    rows = [
-        _write_window(folder / f"window-{i:05d}.bin", *window, views)
-        for i, (window, views) in enumerate(zip(scene.windows, _views_of_windows(scene), strict=True))
-    ]
+    # Details of training images are kept with the window that they stand nearest to.
+    views: list[list[StoredView]] = [[] for _ in scene.windows]
+    if scene.views:
+        shares = window_shares(cameras_of(scene.views)[:, [3, 7, 11]], tuple(place for place, _ in scene.windows))
+        for view, number in zip(scene.views, shares.argmax(-1).tolist(), strict=True):
+            views[number].append(view)
+    rows = [_write_window(folder / f"window-{i:05d}.bin", *window, views[i]) for i, window in enumerate(scene.windows)]
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -144,17 +157,6 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
     return sum(row["bytes"] for row in rows) + len(text)
 
 
-def _views_of_windows(scene: BakedScene) -> list[list[StoredView]]:
-    """Details of the training images that stand nearest to each window."""
-    places = tuple(place for place, _ in scene.windows)
-    views: list[list[StoredView]] = [[] for _ in places]
-    if scene.views:
-        largest = window_shares(cameras_of(scene.views)[:, [3, 7, 11]], places).argmax(-1).tolist()
-        for view, window in zip(scene.views, largest, strict=True):
-            views[window].append(view)
-    return views
-
-
 def _write_window(file: Path, place: Window, window: BakedWindow, views: list[StoredView]) -> dict[str, Any]:
     """Writes a window's arrays one after the other, each compressed, and then details; returns the window's part of the
     header."""
@@ -164,19 +166,15 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
     early[seen.argsort(descending=True, stable=True)[: math.ceil(EARLY * len(seen))]] = True
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     channels = [mpis.density, *mpis.texels.unbind(-1)]
-    parts = list(in_order(lambda channel: split_codes(channel, beside), channels))
-
-    def coarse(bricks: Tensor) -> NDArray[np.uint8]:
-        return np.stack([coarse_differences(coarse[bricks.numpy()]) for coarse, _ in parts])
-
+    coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
     network = [x.detach().half().reshape(-1) for layer in shader.layers for x in layer]
     arrays = {
         "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
-        "early": coarse(early),
+        "early": coarse_differences(coarse[:, early.numpy()]),
         "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
         "columns": mpis.columns[:, 0].numpy().view(np.uint32),
-        "late": coarse(~early),
-        "fine": np.stack([fine for _, fine in parts]),
+        "late": coarse_differences(coarse[:, ~early.numpy()]),
+        "fine": fine,
     }
     blob, places = b"", {}
     for name, array in arrays.items():
@@ -298,14 +296,8 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, Baked
     masks, early_masks = (torch.from_numpy(array(name).view(np.int32)) for name in ("columns", "early_columns"))
     columns, early = numbered_columns(masks), bits_of(early_masks)[bits_of(masks) > 0] > 0
     beside = neighbours(columns, plan.mpis, len(early))
-
-    def joined(parts: tuple[NDArray[np.uint8], ...]) -> UInt8[Tensor, "B 8 8"]:
-        coarse = np.empty((len(early), SIDE // 2, SIDE // 2), np.uint8)
-        for part, which in zip(parts[:2], (early, ~early), strict=True):
-            coarse[which.numpy()] = coarse_codes(part)
-        return joined_codes(coarse, parts[2], beside)
-
-    density, *texels = map(joined, zip(*map(array, ("early", "late", "fine")), strict=True))
+    channels = zip(*map(array, ("early", "late", "fine")), strict=True)
+    density, *texels = (joined_codes(parts, early, beside) for parts in channels)
     baked = BakedMpis(
         plan.mpis,
         tuple(m["interval"] for m in row["mpis"]),
@@ -350,27 +342,26 @@ def split_codes(
 
 
 def coarse_differences(coarse: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Stored form [16, B] of coarse codes [B, 4, 4]: differences along rows and columns, and of first texels along
-    bricks."""
-    stored = np.diff(np.diff(coarse, axis=2, prepend=np.uint8(0)), axis=1, prepend=np.uint8(0))
-    stored[:, 0, 0] = np.diff(stored[:, 0, 0], prepend=np.uint8(0))
-    return stored.reshape(len(coarse), -1).T
-
-
-def coarse_codes(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Coarse codes [B, 4, 4] from their stored form [16, B]."""
-    codes = stored.T.reshape(-1, SIDE // 2, SIDE // 2).copy()
-    codes[:, 0, 0] = np.cumsum(codes[:, 0, 0], dtype=np.uint8)
-    return codes.cumsum(1, dtype=np.uint8).cumsum(2, dtype=np.uint8)
+    """Coarse codes [C, B, 4, 4] as they are stored [C, 16, B]: differences along rows and columns, and along bricks for
+    the first texels."""
+    stored = np.diff(np.diff(coarse, axis=3, prepend=np.uint8(0)), axis=2, prepend=np.uint8(0))
+    stored[:, :, 0, 0] = np.diff(stored[:, :, 0, 0], prepend=np.uint8(0))
+    return stored.reshape(*coarse.shape[:2], -1).swapaxes(1, 2)
 
 
 def joined_codes(
-    coarse: NDArray[np.uint8], fine: NDArray[np.uint8], beside: Int[Tensor, "2 B"]
+    parts: tuple[NDArray[np.uint8], ...], is_early: Bool[Tensor, "B"], beside: Int[Tensor, "2 B"]
 ) -> UInt8[Tensor, "B 8 8"]:
-    """The codes that ``split_codes`` split."""
-    codes = np.empty((len(coarse), SIDE, SIDE), np.uint8)
-    codes[:, ::2, ::2], codes[:, ~COARSE] = coarse, fine.T
-    codes[:, ::2, 1::2] += _means(coarse, 2)
+    """The codes of a channel from its stored parts (``split_codes``, ``coarse_differences``): coarse codes of the early
+    bricks, those of the others, and fine ones."""
+    early, late, fine = parts
+    codes = np.empty((fine.shape[1], SIDE, SIDE), np.uint8)
+    for stored, bricks in ((early, is_early.numpy()), (late, ~is_early.numpy())):
+        coarse = stored.T.reshape(-1, SIDE // 2, SIDE // 2).copy()
+        coarse[:, 0, 0] = np.cumsum(coarse[:, 0, 0], dtype=np.uint8)
+        codes[bricks, ::2, ::2] = coarse.cumsum(1, dtype=np.uint8).cumsum(2, dtype=np.uint8)
+    codes[:, ~COARSE] = fine.T
+    codes[:, ::2, 1::2] += _means(codes[:, ::2, ::2], 2)
     codes[:, 1::2] += _means(codes[:, ::2], 1)
     joined = torch.from_numpy(codes)
     take_borders(joined, beside)

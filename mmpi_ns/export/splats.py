@@ -19,12 +19,11 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from mmpi_ns.export.files import BakedScene, Pose
+from mmpi_ns.export.files import Pose
 from mmpi_ns.ops.gather import COLORS, activate
 from mmpi_ns.ops.splat import BLUR, Gaussians, View, splat_image, splat_opacities, splat_sums
 from mmpi_ns.rendering.baked import BakedWindow
-from mmpi_ns.scene.baked import CELLS, SIDE, brick_numbers, columns_of
-from mmpi_ns.scene.windows import Window, window_shares
+from mmpi_ns.scene.baked import CELLS, SIDE, brick_numbers
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order
 
@@ -120,14 +119,6 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
     return splats
 
 
-def poses_in(place: Window, scene: BakedScene) -> list[Pose]:
-    """Training cameras that a window renders."""
-    poses = [pose for pose in scene.path if not pose.test]
-    shares = window_shares(torch.tensor([p.to_world for p in poses])[:, :, 3], tuple(w for w, _ in scene.windows))
-    number = [w for w, _ in scene.windows].index(place)
-    return [pose for pose, share in zip(poses, shares[:, number].tolist(), strict=True) if share > 0]
-
-
 def between(poses: list[Pose], fraction: float) -> list[Pose]:
     """Cameras interpolated at a fraction of the way from each to the next."""
     cameras = []
@@ -174,9 +165,7 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
     mpis, keys, steps = window.mpis, torch.full(peaks.shape, -1), torch.arange(SIDE)
     sizes = torch.tensor([[m.planes, m.height, m.width] for m in mpis.mpis])
     starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.prod(1).cumsum(0)])
-    for k, mpi in enumerate(mpis.mpis):
-        first = mpis.first_column(k)
-        numbers = brick_numbers(mpis.columns[first : first + columns_of(mpi)], mpi)
+    for k, (mpi, numbers) in enumerate(zip(mpis.mpis, brick_numbers(mpis.columns, mpis.mpis), strict=True)):
         plane, row, column = ((numbers >= 0).nonzero()).unbind(-1)
         y, x = (row * CELLS)[:, None, None] + steps[:, None], (column * CELLS)[:, None, None] + steps
         key = (plane[:, None, None] * mpi.height + y) * mpi.width + x + starts[k]

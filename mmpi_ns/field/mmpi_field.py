@@ -229,7 +229,8 @@ class MMPIField(TexelTables):
         if not isinstance(self.networks, RayShader):
             lookup = lookup if lookup is None or chosen is None else lookup.of_rays(chosen)
             colors = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]
-            return RayColors.of_samples(composite, render_colors(composite, colors), colors)
+            rgb, weights = render_colors(composite, colors), composite.weights.detach()[..., None]
+            return RayColors(rgb, weights.sum(1), (weights * colors).sum(1), (weights * colors**2).sum(1))
         if lookup is None:
             sums = gather_places(self.layout, self.features.data, places_of(ray_samples), composite.weights)
         else:

@@ -15,7 +15,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mmpi_ns.field.tables import replace_data
-from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.shade import Layers, positional_encoding, run_layers, sample_colors
 
@@ -104,17 +103,6 @@ class RayColors:
     """Sum of weight times colour of each sample."""
     second: Float[Tensor, "R 3"]
     """Sum of weight times squared colour."""
-
-    @staticmethod
-    def of_samples(composite: Composite, rgb: Float[Tensor, "R 3"], colors: Float[Tensor, "R S 3"]) -> RayColors:
-        """The sums for samples with a colour each."""
-        weights = composite.weights.detach()[..., None]
-        first, second = (weights * colors).sum(1), (weights * colors**2).sum(1)
-        return RayColors(rgb, weights.sum(1), first, second)
-
-    def of_rays(self, rays: Int[Tensor, "P"]) -> RayColors:
-        """The sums of the chosen rays."""
-        return RayColors(*(x.index_select(0, rays) for x in (self.rgb, self.mass, self.first, self.second)))
 
 
 class RayShader(Networks):

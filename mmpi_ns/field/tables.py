@@ -15,8 +15,8 @@ from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
 from mmpi_ns.field.samples import Lookup
-from mmpi_ns.ops.interpolate import Table, raise_peaks
-from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, resample, take_bricks, tiles_with_copies
+from mmpi_ns.ops.interpolate import Table
+from mmpi_ns.scene.bricks import grown_tiles, new_table, resample, take_bricks, tiles_with_copies
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
@@ -211,7 +211,8 @@ class TexelTables(Field):
         weights = weights.reshape(-1)[lookup.index]
         sizes = [len(taps.positions) for taps in lookup.taps]
         for taps, weight in zip(lookup.taps, weights.split(sizes), strict=True):
-            raise_peaks(self.peak, lookup.rows, taps.positions, weight)
+            bricks = (lookup.rows // BRICK)[taps.positions.reshape(-1)]
+            self.peak.scatter_reduce_(0, bricks, weight.repeat_interleave(taps.positions.shape[1]), "amax")
         if self.num_copies == 0:
             shares = weights * errors[lookup.rays]
             for taps, share in zip(lookup.taps, shares.split(sizes), strict=True):
@@ -244,9 +245,13 @@ class TexelTables(Field):
         return self._keep(self.touched.view(-1, BRICK).any(-1))
 
     def _keep(self, keep: Bool[Tensor, "B"]) -> Int[Tensor, "K"] | None:
-        self.tiles, kept = keep_bricks(self.tiles, keep)
+        """Releases the other bricks. Returns as ``release_unused``."""
+        keep = keep.clone()
+        keep[0] = True  # the empty brick
+        numbers, kept = (keep.cumsum(0) - 1) * keep, keep.nonzero()[:, 0]
         if len(kept) == len(keep):
             return None
+        self.tiles = numbers[self.tiles.to(torch.int64)].to(torch.int32)
         for name in TABLES:
             table = getattr(self, name)
             replace_data(table, take_bricks(table.data, kept))

@@ -93,13 +93,14 @@ def log_shares(
     """
     chosen, texels, cover = [], [], []
     for j, grid in enumerate(layout.grids):
-        ray = local.table(j).index_select(0, rays)
         if j < len(layout.mpis):
-            point = ray[:, :3] * inverse_t[:, None] + ray[:, 3:]
+            origins, directions = (x[:, j].index_select(0, rays) for x in (local.local_origins, local.local_directions))
+            point = origins * inverse_t[:, None] + directions
             ndc, inside = (x[:, 0] for x in local_to_ndc(point[:, None], inverse_t[:, None], layout.frames.one(j)))
         else:
             assert layout.cube is not None
-            ndc = layout.cube.normalised(ray[:, :3] + ray[:, 3:] / inverse_t.clamp(min=1e-10)[:, None])
+            origins, directions = (x.index_select(0, rays) for x in (local.origins, local.directions))
+            ndc = layout.cube.normalised(origins + directions / inverse_t.clamp(min=1e-10)[:, None])
             ndc, inside = ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1) & (inverse_t > 0)
         is_own = heads == j
         votes = inside | is_own

@@ -244,29 +244,26 @@ def _try(name: str) -> str | None:
             record.parent.mkdir(parents=True, exist_ok=True)
             record.touch()
     except Exception as error:  # a driver, a compiler or a cache folder may fail in many ways: all mean plain torch
-        if lacking := _lacking(error):
-            _faults["Triton"] = _say(lacking)  # no other kernel will do better
-            return lacking
-        return _say(f"its Triton kernel fails on this device ({_words(error)})", f"Plain torch for {name}")
+        headers = Path(sysconfig.get_paths()["include"]) / "Python.h"
+        # Triton has a piece of C compiled for each kernel.
+        if isinstance(error, RuntimeError) and "C compiler" in str(error):
+            lacking = "Triton finds no C compiler: install gcc"
+        elif isinstance(error, subprocess.CalledProcessError) and not headers.is_file():
+            version = sysconfig.get_python_version()
+            lacking = f"Triton needs Python's headers, and {headers} is missing: install python{version}-dev"
+        elif isinstance(error, subprocess.CalledProcessError):
+            compiler = Path(error.cmd[0]).name
+            lacking = f"{compiler} cannot compile what starts Triton's kernels; its words are above"
+        else:
+            return _say(f"its Triton kernel fails on this device ({_words(error)})", f"Plain torch for {name}")
+        _faults["Triton"] = _say(lacking)  # no other kernel will do better
+        return lacking
     return None
 
 
 @functools.cache
 def _announce() -> None:
     CONSOLE.print(f"Compiling kernels for {torch.cuda.get_device_name()}: about a minute, once.")
-
-
-def _lacking(error: Exception) -> str | None:
-    """What Triton lacks to start any kernel: it has a piece of C compiled for each."""
-    if isinstance(error, RuntimeError) and "C compiler" in str(error):
-        return "Triton finds no C compiler: install gcc"
-    if isinstance(error, subprocess.CalledProcessError):
-        include = Path(sysconfig.get_paths()["include"])
-        if not (include / "Python.h").is_file():
-            version = sysconfig.get_python_version()
-            return f"Triton needs Python's headers, and {include / 'Python.h'} is missing: install python{version}-dev"
-        return f"{Path(error.cmd[0]).name} cannot compile what starts Triton's kernels; its words are above"
-    return None
 
 
 def _words(error: Exception) -> str:

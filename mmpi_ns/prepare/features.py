@@ -17,7 +17,6 @@ from typing import Literal
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import DisjointSet
 from scipy.cluster.vq import kmeans2, vq
 
 from mmpi_ns.capture.matching import (
@@ -34,6 +33,8 @@ from mmpi_ns.prepare.images import Photo
 from mmpi_ns.utils.errors import InputError, progress
 from mmpi_ns.utils.files import whole
 
+DATABASE = "database.db"
+"""Name of a database in its folder."""
 BATCH = 8
 """Images extracted at a time: the most that an interruption loses."""
 PAIR_BATCH = 64
@@ -66,25 +67,26 @@ FAR_STEPS = (15, 20, 30, 45)
 Pairs = list[tuple[int, int]]
 
 
-def create_database(
-    path: Path, photos: Sequence[Photo], numbers: Sequence[int], cameras: Sequence[pycolmap.Camera]
-) -> None:
-    """A database of the images and cameras, without features, unless it is there."""
-    if not path.exists():
-        path.with_name(path.name + ".partial").unlink(missing_ok=True)
-        with whole(path) as partial:
-            write_images(new_model(cameras, [p.name for p in photos], numbers), partial)
-
-
 def extract(
-    database: Path, images: Path, photos: Sequence[Photo], masks: Path | None, max_features: int, threads: int
+    images: Path,
+    photos: Sequence[Photo],
+    cameras: tuple[Sequence[int], Sequence[pycolmap.Camera]],
+    masks: Path | None,
+    max_features: int,
+    threads: int,
+    folder: Path,
 ) -> None:
-    """SIFT features of all images; images that have theirs are skipped.
+    """SIFT features of all images, in the database of a folder; images that have theirs are skipped.
 
+    The database is made if it is missing, with ``cameras``: the number of each image's, and the cameras themselves.
     Weak features count too if most of a sample of the images have less than half of the features that they may have.
     Raises InputError if an image cannot be read, or hardly any has features.
     """
-    names = [p.name for p in photos]
+    names, database = [p.name for p in photos], folder / DATABASE
+    if not database.exists():
+        database.with_name(DATABASE + ".partial").unlink(missing_ok=True)
+        with whole(database) as partial:
+            write_images(new_model(cameras[1], names, cameras[0]), partial)
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.max_image_size = threads, LARGEST_SIDE
     most = max(p.width * p.height for p in photos) // PIXELS_A_FEATURE
@@ -133,15 +135,6 @@ def matching_pairs(database: Path) -> list[tuple[int, int]]:
     with pycolmap.Database.open(database) as opened:
         pairs, inliers = opened.read_two_view_geometry_num_inliers()
     return [pycolmap.pair_id_to_image_pair(p) for p, n in zip(pairs, inliers, strict=True) if n >= MIN_INLIERS]
-
-
-def connected(database: Path, image_ids: Sequence[int]) -> list[list[int]]:
-    """Groups of at least three of these images that verified matches connect, the largest first."""
-    groups = DisjointSet(image_ids)
-    for first, second in matching_pairs(database):
-        if first in groups and second in groups:
-            groups.merge(first, second)
-    return sorted((sorted(group) for group in groups.subsets() if len(group) > 2), key=len, reverse=True)
 
 
 def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:

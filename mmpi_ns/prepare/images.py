@@ -131,8 +131,20 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
                 with whole(copy) as partial:
                     if is_read and not is_turned:
                         shutil.copyfile(file, partial)
-                    else:
-                        _convert(image, partial, copy.suffix.lower())
+                    else:  # upright in 8 bits: nerfstudio would show it rotated, or not read it
+                        upright = ImageOps.exif_transpose(image)
+                        if upright.mode.startswith(("I", "F")):
+                            values = np.asarray(upright, dtype=np.float64)
+                            is_deep = upright.mode.startswith("I") and values.max() > 255
+                            top = 65535.0 if is_deep else max(float(values.max()), 1e-9)
+                            upright = Image.fromarray(np.clip(values / top * 255, 0, 255).astype(np.uint8))
+                        has_alpha = upright.mode in ("RGBA", "LA", "PA") and copy.suffix.lower() == ".png"
+                        upright = upright.convert("L" if upright.mode in ("1", "L") else "RGBA" if has_alpha else "RGB")
+                        tags = kept_tags(image)
+                        if copy.suffix.lower() == ".png":
+                            upright.save(partial, format="PNG", exif=tags)
+                        else:
+                            upright.save(partial, format="JPEG", quality=97, subsampling=0, exif=tags)
             shot = exif.get_ifd(ExifTags.IFD.Exif)
             parts = [exif.get(tag) for tag in BODY_TAGS] + [shot.get(tag) for tag in FOCAL_TAGS]
             lens = " ".join(str(part).strip() for part in parts if part)
@@ -151,20 +163,6 @@ def open_image(path: Path) -> Image.Image:
             return image
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
         raise InputError(f"{path} cannot be read ({error}): repair or remove it.") from error
-
-
-def _convert(image: Image.Image, path: Path, suffix: str) -> None:
-    """Upright 8-bit copy of an image that nerfstudio would show rotated or not read."""
-    upright = ImageOps.exif_transpose(image)
-    if upright.mode.startswith(("I", "F")):
-        values = np.asarray(upright, dtype=np.float64)
-        top = 65535.0 if upright.mode.startswith("I") and values.max() > 255 else max(float(values.max()), 1e-9)
-        upright = Image.fromarray(np.clip(values / top * 255, 0, 255).astype(np.uint8))
-    mode = "L" if upright.mode in ("1", "L") else "RGBA" if upright.mode in ("RGBA", "LA", "PA") else "RGB"
-    form = "PNG" if suffix == ".png" else "JPEG"
-    upright = upright.convert("RGB" if form == "JPEG" and mode == "RGBA" else mode)
-    options = {"quality": 97, "subsampling": 0} if form == "JPEG" else {}
-    upright.save(path, format=form, exif=kept_tags(image), **options)
 
 
 def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pycolmap
 from filelock import FileLock, Timeout
+from scipy.cluster.hierarchy import DisjointSet
 
 from mmpi_ns.capture.matching import new_model, rigid3d
 from mmpi_ns.capture.sfm import load_pycolmap
@@ -34,7 +35,7 @@ from mmpi_ns.prepare.video import select_frames
 from mmpi_ns.utils.errors import InputError, progress, quoted, say
 from mmpi_ns.utils.files import whole, write_text
 
-WORK, DATABASE = ".prepare", "database.db"
+WORK = ".prepare"
 FULL = (errno.ENOSPC, errno.EDQUOT)
 LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
@@ -66,15 +67,17 @@ class Preparation:
             self._read()
         with self._timed("features"):
             source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
-            folder, _ = self._stage("features", source, self._find_features)
+            cameras = self.numbers, self.cameras
+            how = self.image_folder, self.photos, cameras, self.masks, s.max_features, s.threads
+            folder, _ = self._stage("features", source, partial(features.extract, *how))
         with self._timed("matching"):
             poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
             source = [s.matching, s.overlap, poses]
-            folder, self.matching = self._stage("matches", source, partial(self._match, folder / DATABASE))
+            folder, self.matching = self._stage("matches", source, partial(self._match, folder / features.DATABASE))
             say(f"Matching: {self.matching}.")
         with self._timed("mapping"):
             source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
-            folder, self.mapped = self._stage("model", source, partial(self._map, folder / DATABASE))
+            folder, self.mapped = self._stage("model", source, partial(self._map, folder / features.DATABASE))
         model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
         count, total = model.num_reg_images(), len(self.photos)
         if count < LEAST_SHARE * total and not s.allow_partial:
@@ -124,7 +127,8 @@ class Preparation:
         self.times[name] = time.monotonic() - start
 
     def _read(self) -> None:
-        """Images, masks and known poses, whether the images come in the order of the motion, and their cameras."""
+        """Images, masks and known poses, whether the images come in the order of the motion, and their cameras with
+        whether intrinsics are to be kept."""
         s = self.settings
         self.is_video = s.input.is_file()
         if self.is_video and s.input.suffix.lower() not in images.VIDEOS:
@@ -151,11 +155,6 @@ class Preparation:
                 "(better twenty), or give known poses (--poses)."
             )
         self._split([p.name for p in self.photos])  # refuse a split that is impossible before the work
-        self._set_cameras()
-
-    def _set_cameras(self) -> None:
-        """Numbers and cameras of the images, and whether their intrinsics are to be kept."""
-        s = self.settings
         lenses = self.known_poses.intrinsics if self.known_poses else {}
         if s.camera is not None:
             lenses = dict.fromkeys((p.name for p in self.photos), parse_camera(s.camera, s.lens == "fisheye"))
@@ -167,14 +166,9 @@ class Preparation:
             raise InputError("Known poses need the intrinsics they were made with: give --focal or --camera.")
         self.is_fixed = (is_given or self.known_poses is not None) and not s.refine_intrinsics
 
-    def _find_features(self, folder: Path) -> None:
-        s, database = self.settings, folder / DATABASE
-        features.create_database(database, self.photos, self.numbers, self.cameras)
-        features.extract(database, self.image_folder, self.photos, self.masks, s.max_features, s.threads)
-
     def _match(self, unmatched: Path, folder: Path) -> str:
         """Makes the database with verified matches; what was matched in words."""
-        s, database, names = self.settings, folder / DATABASE, [p.name for p in self.photos]
+        s, database, names = self.settings, folder / features.DATABASE, [p.name for p in self.photos]
         if not database.exists():
             with whole(database) as unfinished:
                 shutil.copyfile(unmatched, unfinished)
@@ -190,8 +184,8 @@ class Preparation:
         return f"{says}; {verified} of {len(pairs)} pairs match"
 
     def _map(self, database: Path, folder: Path) -> dict[str, Any]:
-        """Makes the model; how, the verdict, the interval of a refined focal length, and connected groups of images
-        without a pose."""
+        """Makes the model; how, the verdict, the interval of a refined focal length, and groups of at least
+        three images without a pose that verified matches connect, the largest first."""
         s, names = self.settings, [p.name for p in self.photos]
         verdict, groups, focal = Verdict("right"), [], None
         if self.known_poses is not None:
@@ -208,7 +202,12 @@ class Preparation:
                 Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)
             )
             lost = sorted(set(range(1, len(names) + 1)) - set(model.reg_image_ids()))
-            groups = [[names[i - 1] for i in group] for group in features.connected(database, lost)]
+            connected = DisjointSet(lost)
+            for first, second in features.matching_pairs(database):
+                if first in connected and second in connected:
+                    connected.merge(first, second)
+            subsets = sorted((sorted(group) for group in connected.subsets() if len(group) > 2), key=len, reverse=True)
+            groups = [[names[i - 1] for i in group] for group in subsets]
         (folder / "model").mkdir(exist_ok=True)
         model.write(folder / "model")
         if not self.is_fixed:
@@ -256,17 +255,14 @@ class Preparation:
         intrinsics = "given and kept" if self.is_fixed else "refined"
         lens = "undone" if s.undistort else "kept in transforms.json"
         note = f"Intrinsics {intrinsics}; {len(self.cameras)} camera(s); lens distortion {lens}."
-        checks.write_report(model, s.input.name, rows, findings, self._left_out(names), note, built)
+        groups = self.mapped["groups"]
+        lost = [p.name for p in self.photos if p.name not in names.union(*groups)]
+        apart = "images form a group of their own, not connected to the scene"
+        left_out = [f"{len(lost)} images have no pose and are left out: {in_short(lost, 8)}"] if lost else []
+        left_out += [f"{len(group)} {apart}: {in_short(group, 8)}" for group in groups]
+        checks.write_report(model, s.input.name, rows, findings, left_out, note, built)
         self._publish(findings, model, verdict, split)
         return verdict
-
-    def _left_out(self, registered: set[str]) -> list[str]:
-        """Sentences on the images without a pose."""
-        groups = self.mapped["groups"]
-        lost = [p.name for p in self.photos if p.name not in registered.union(*groups)]
-        apart = "images form a group of their own, not connected to the scene"
-        sentences = [f"{len(lost)} images have no pose and are left out: {in_short(lost, 8)}"] if lost else []
-        return sentences + [f"{len(group)} {apart}: {in_short(group, 8)}" for group in groups]
 
     def _split(self, names: Sequence[str]) -> export.Split:
         s = self.settings

@@ -160,7 +160,15 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         meta = json.loads(path.read_text(encoding="utf-8"))
         frames: list[dict[str, Any]] = meta["frames"]
         files = [Path(f["file_path"]) for f in frames]
-        places = {p.name: n for p in photos if (n := _frame_of(p, files)) is not None}
+        places = {}  # the frame with an image's name, and its folder if several have that name
+        for photo in photos:
+            for name in (Path(photo.name), Path(photo.source)):
+                named = [n for n, f in enumerate(files) if f.stem == name.stem]
+                folders = name.parent.parts
+                inside = [n for n in named if files[n].parent.parts[-len(folders) :] == folders] if folders else []
+                if len(named) == 1 or len(inside) == 1:
+                    places[photo.name] = (inside or named)[0]
+                    break
         _check_apart(places, path)
         poses, intrinsics = {}, {}
         for photo in (p for p in photos if p.name in places):
@@ -180,17 +188,6 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         raise InputError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
     split = meta if "train_filenames" in meta and "test_filenames" in meta else None
     return KnownPoses(poses, "poses of a transforms.json, by name", intrinsics, split)
-
-
-def _frame_of(photo: Photo, files: Sequence[Path]) -> int | None:
-    """Number of the frame with an image's name, and its folder if several have that name; None without one."""
-    for path in (Path(photo.name), Path(photo.source)):
-        named = [n for n, f in enumerate(files) if f.stem == path.stem]
-        folders = path.parent.parts
-        inside = [n for n in named if files[n].parent.parts[-len(folders) :] == folders] if folders else []
-        if len(named) == 1 or len(inside) == 1:
-            return (inside or named)[0]
-    return None
 
 
 def _check_apart(poses: dict[str, Any], path: Path) -> None:

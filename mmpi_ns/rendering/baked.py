@@ -34,7 +34,6 @@ from mmpi_ns.scene.baked import (
     Shader,
     brick_numbers,
     columns_from,
-    columns_of,
 )
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
@@ -143,9 +142,7 @@ class BakedWindow:
     def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:
         """The same window with only some of the bricks."""
         mpis, columns, first = self.mpis, [], 0
-        for k, mpi in enumerate(mpis.mpis):
-            start = mpis.first_column(k)
-            numbers = brick_numbers(mpis.columns[start : start + columns_of(mpi)], mpi)
+        for numbers in brick_numbers(mpis.columns, mpis.mpis):
             columns_here, places = columns_from((numbers >= 0) & kept[numbers.clamp(min=0)], first)
             columns.append(columns_here)
             first += len(places)

@@ -52,19 +52,16 @@ class Exposures(torch.nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def shown(self, mode: Literal["mean", "nearest"], bundle: RayBundle) -> Float[Tensor, "3"] | None:
-        """Exposure that an image is shown at; None where all have the field's."""
+        """Exposure that an image is shown at, the mean one or that of the training image taken nearest; None where all
+        have the field's."""
         if self.mean is None or mode == "mean" or not len(bundle):
             return self.mean
-        return self.nearest(bundle.origins.reshape(-1, 3)[0])
+        return self.factors[(self.centers - bundle.origins.reshape(-1, 3)[0]).norm(dim=-1).argmin()]
 
     @property
     def mean(self) -> Float[Tensor, "3"] | None:
         """Mean exposure of the training images; None where all have the field's."""
         return self.factors.log().mean(0).exp() if len(self.factors) else None
-
-    def nearest(self, center: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-        """Exposure of the training image that was taken nearest to a position."""
-        return self.factors[(self.centers - center).norm(dim=-1).argmin()]
 
 
 def exposure_of_image(

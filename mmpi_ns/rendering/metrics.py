@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -21,13 +22,13 @@ WINDOW = 11
 """Side of SSIM's window, pixels."""
 
 
+@dataclass(eq=False)
 class ImageMetrics:
     """Metrics of a rendered image. LPIPS downloads its weights on first use and is left out without them."""
 
-    def __init__(self, lpips_net: Literal["vgg", "alex", "none"]) -> None:
-        self.lpips_net: Literal["vgg", "alex", "none"] = lpips_net
-        self._lpips: nn.Module | None = None
-        self._lpips_tried = False
+    lpips_net: Literal["vgg", "alex", "none"]
+    _lpips: nn.Module | None = None
+    _lpips_tried: bool = False
 
     @torch.no_grad()
     def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
@@ -102,13 +103,30 @@ def _parts(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) ->
     return zip(predicted.reshape(-1, 3).split(PART), observed.reshape(-1, 3).split(PART), strict=True)
 
 
-def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"]) -> dict[str, float]:
-    """Relative error of rendered distances at the pixels with a true one: median, and fraction above a tenth."""
-    measured = true > 0
-    if not bool(measured.any()):
-        return {}
-    error = (predicted[measured] / true[measured] - 1).abs()
-    return {"depth_error": float(error.median()), "depth_outliers": float((error > 0.1).float().mean())}
+def image_scores(
+    metrics: ImageMetrics, outputs: dict[str, Tensor], observed: Float[Tensor, "H W 3"], true: Tensor | None
+) -> dict[str, float]:
+    """Metrics of a rendered image.
+
+    Args:
+        metrics: of colours.
+        outputs: of the image; "field_rgb" are the colours of the field alone, if details were added.
+        observed: the image.
+        true: distances of its pixels, 0 where unknown, if there are any. [H, W, 1]
+
+    Returns:
+        Those of ``metrics``; "field_..." of the field alone; the mean "dropped_mass"; and where distances are known the
+        relative error of rendered ones: the median, and the fraction above a tenth.
+    """
+    values = metrics(outputs["rgb"], observed)
+    if "field_rgb" in outputs:
+        values |= {f"field_{name}": value for name, value in psnr_and_ssim(outputs["field_rgb"], observed).items()}
+    values["dropped_mass"] = float(outputs["dropped_mass"].mean())
+    if true is not None and bool((true > 0).any()):
+        predicted, true = outputs["depth"], true.to(outputs["depth"])
+        error = (predicted[true > 0] / true[true > 0] - 1).abs()
+        values |= {"depth_error": float(error.median()), "depth_outliers": float((error > 0.1).float().mean())}
+    return values
 
 
 def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:

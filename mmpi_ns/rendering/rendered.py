@@ -10,7 +10,7 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
-from mmpi_ns.capture.ray_sources import is_pixel_ray
+from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.field.shading import RayColors, RayShader
@@ -129,8 +129,10 @@ def render_rays(
             tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
     valid, before = meta["valid"][..., 0], meta["skipped_before"][..., 0]
     composite = composite_weights(tau, valid, before, report.skipped_total)
-    # Keypoint rays are supervised in depth alone: no colours for them.
-    colors = field.render_colors(samples, lookup, composite, lookup and is_pixel_ray(bundle))
+    # Keypoint rays, whose points have a known depth and no pixel, are supervised in depth alone: no colours for them.
+    keypoint_depths = None if lookup is None else bundle.metadata.get(KEYPOINT_DEPTH)
+    chosen = None if keypoint_depths is None else keypoint_depths[:, 0] == 0
+    colors = field.render_colors(samples, lookup, composite, chosen)
     return RenderedRays(bundle, samples, composite, colors, report, lookup)
 
 

@@ -16,9 +16,12 @@ from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, march
+from mmpi_ns.scene.plan import ScenePlan
 
 DIRECTION_AT_INFINITY = 1e-10
 """Inverse distances below this become a distance of 1e10 in nerfstudio's starts and ends."""
+FAIR_SHARE = 0.1
+"""While surfaces are forming, samples with more than this fraction of an equal weight are kept."""
 
 
 @dataclass
@@ -31,6 +34,14 @@ class SamplingConfig:
     """Samples per voxel side along a ray through the cube."""
     cube_alpha: float = 1e-3
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
+
+    def bounds(self, plan: ScenePlan, forming: bool) -> dict[str, float]:
+        """Minimum weights of samples kept in training (``ops.march.prune``).
+
+        While surfaces are forming, samples of little weight must learn too, and the cube starts nearly empty.
+        """
+        cube = 0.1 * self.cube_alpha if forming and plan.cube is not None else float("inf")
+        return {"threshold": min(self.threshold, cube), "fair_share": FAIR_SHARE if forming else float("inf")}
 
 
 class MMPISampler(Sampler):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 from weakref import WeakValueDictionary
@@ -22,25 +23,23 @@ _DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.Unpickl
 """Exceptions of reading a damaged file."""
 
 
+@dataclass(eq=False)
 class WindowStore:
-    """Finished windows, one file each. Several threads may render from one store.
+    """Finished windows, one file each. Several threads may render from one store."""
 
-    Args:
-        folder: of the files; None if there is only one window.
-        empty: makes a field of the run's settings to load into.
-        budget: bytes of the windows kept for rendering. The window being rendered is kept in any case.
-        half: write tables in half precision.
-    """
-
-    def __init__(
-        self, folder: Path | None, empty: Callable[[], MMPIField], budget: float = 0.0, half: bool = False
-    ) -> None:
-        self.folder, self.budget, self.half = folder, budget, half
-        self._empty, self._lock = empty, Lock()
-        self._held: dict[int, MMPIField] = {}
-        """Windows in memory, the most recently used last."""
-        self._alive: WeakValueDictionary[int, MMPIField] = WeakValueDictionary()
-        """These and windows still in use: evicting a window does not take it from a thread that is rendering it."""
+    folder: Path | None
+    """Of the files; None if there is only one window."""
+    empty: Callable[[], MMPIField]
+    """Makes a field of the run's settings to load into."""
+    budget: float = 0.0
+    """Bytes of the windows kept for rendering. The window being rendered is kept in any case."""
+    half: bool = False
+    """Write tables in half precision."""
+    _lock: Lock = field(default_factory=Lock)
+    _held: dict[int, MMPIField] = field(default_factory=dict)
+    """Windows in memory, the most recently used last."""
+    _alive: WeakValueDictionary[int, MMPIField] = field(default_factory=WeakValueDictionary)
+    """These and windows still in use: evicting a window does not take it from a thread that is rendering it."""
 
     def path(self, window: int) -> Path:
         assert self.folder is not None, "several windows need a folder"
@@ -99,7 +98,7 @@ class WindowStore:
             needed = sum(values.nbytes * (2 if name in half else 1) for name, values in state.items())
             while self._held and needed + sum(map(_bytes_of, self._held.values())) > self.budget:
                 del self._held[next(iter(self._held))]  # the least recently used
-            field = self._empty()
+            field = self.empty()
             field.load_state_dict({name: x.float() if name in half else x for name, x in state.items()})
         except (*_DAMAGED, AttributeError) as error:
             raise InputError(

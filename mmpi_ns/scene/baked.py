@@ -8,6 +8,8 @@ ray which of the next planes it can skip.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +17,6 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from mmpi_ns.scene.geometry import Frames
 from mmpi_ns.scene.plan import MPIPlan
 
 SIDE = 8
@@ -84,12 +85,6 @@ class BakedMpis:
     """The scene in the layout of a compiled operation, which fills it once."""
 
     @property
-    def frames(self) -> Frames:
-        if "frames" not in self.packed:
-            self.packed["frames"] = Frames.pack(self.mpis)
-        return self.packed["frames"]
-
-    @property
     def sizes(self) -> dict[str, int]:
         """Sizes of the letters in shapes: bricks, and MPIs, which are also the heads."""
         return {"B": self.num_bricks, "K": len(self.mpis), "H": len(self.mpis)}
@@ -103,7 +98,8 @@ class BakedMpis:
         return self.columns.nbytes + self.density.nbytes + self.texels.nbytes
 
     def first_column(self, k: int) -> int:
-        return sum(columns_of(m) for m in self.mpis[:k])
+        """Of MPI k; of those behind the last one, the number of columns."""
+        return sum(math.prod(tiles_of(m)) for m in self.mpis[:k])
 
     def optical_depth(self, k: int, codes: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """tau of head k from interpolated codes."""
@@ -114,11 +110,6 @@ class BakedMpis:
 def tiles_of(mpi: MPIPlan) -> tuple[int, int, int]:
     """Words of planes, and rows and columns of tiles, of an MPI."""
     return -(-mpi.planes // WORD), -(-(mpi.height - 1) // CELLS), -(-(mpi.width - 1) // CELLS)
-
-
-def columns_of(mpi: MPIPlan) -> int:
-    words, down, across = tiles_of(mpi)
-    return words * down * across
 
 
 def bits_of(masks: Int[Tensor, "N"]) -> Int[Tensor, "N 32"]:
@@ -132,22 +123,22 @@ def numbered_columns(masks: Int[Tensor, "N"]) -> Int[Tensor, "N 2"]:
     return torch.stack([masks, counts.cumsum(0) - counts], -1).to(torch.int32)
 
 
-def brick_numbers(columns: Int[Tensor, "N 2"], mpi: MPIPlan) -> Int[Tensor, "P Y X"]:
-    """Brick of every tile of one MPI from its columns; -1 if it is empty."""
-    words, down, across = tiles_of(mpi)
+def brick_numbers(columns: Int[Tensor, "N 2"], mpis: Sequence[MPIPlan]) -> Iterator[Int[Tensor, "P Y X"]]:
+    """Brick of every tile of each MPI from the columns of all; -1 if it is empty."""
     bits = bits_of(columns[:, 0])
     numbers = torch.where(bits > 0, columns[:, 1:] + bits.cumsum(1) - bits, -1)
-    return numbers.view(words, down, across, WORD).permute(0, 3, 1, 2).reshape(-1, down, across)[: mpi.planes]
+    for mpi, columns_here in zip(mpis, numbers.split([math.prod(tiles_of(m)) for m in mpis]), strict=True):
+        words, down, across = tiles_of(mpi)
+        yield columns_here.view(words, down, across, WORD).permute(0, 3, 1, 2).reshape(-1, down, across)[: mpi.planes]
 
 
 def neighbours(columns: Int[Tensor, "N 2"], mpis: tuple[MPIPlan, ...], count: int) -> Int[Tensor, "2 B"]:
     """The bricks to the right of each brick and below it, in its plane; -1 if there is none."""
-    bricks, start = torch.full((2, count), -1), 0
-    for mpi in mpis:
-        numbers = brick_numbers(columns[start : start + columns_of(mpi)], mpi).to(torch.int64)
+    bricks = torch.full((2, count), -1)
+    for numbers in brick_numbers(columns, mpis):
+        numbers = numbers.to(torch.int64)
         beside = torch.nn.functional.pad(numbers, (0, 1, 0, 1), value=-1)
         bricks[:, numbers[numbers >= 0]] = torch.stack([beside[:, :-1, 1:], beside[:, 1:, :-1]])[:, numbers >= 0]
-        start += columns_of(mpi)
     return bricks
 
 

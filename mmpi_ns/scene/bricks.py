@@ -43,14 +43,6 @@ def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, im
     table.view(-1, SIDE, SIDE, table.shape[-1])[tiles[stored].to(torch.int64)] = blocks[stored]
 
 
-def keep_bricks(tiles: Int[Tensor, "T"], keep: Bool[Tensor, "B"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "K"]]:
-    """``tiles`` without the released bricks, and the previous numbers of the others (including 0)."""
-    keep = keep.clone()
-    keep[0] = True
-    numbers = (keep.cumsum(0) - 1) * keep
-    return numbers[tiles.to(torch.int64)].to(torch.int32), keep.nonzero()[:, 0]
-
-
 def take_bricks(table: Float[Tensor, "N C"], kept: Int[Tensor, "K"]) -> Float[Tensor, "M C"]:
     """The chosen bricks of a table."""
     return table.view(-1, BRICK, *table.shape[1:])[kept].flatten(0, 1)
@@ -110,16 +102,6 @@ def tiles_with_copies(
         wide = taken.repeat_interleave(FINER, 1).repeat_interleave(FINER, 2)[:, : copy.down, : copy.across]
         fine[copy.first_tile :][: wide.numel()] = wide.reshape(-1)
     return fine, kept
-
-
-def widened_tiles(grids: list[TexelGrid], chosen: Bool[Tensor, "T"]) -> Bool[Tensor, "T"]:
-    """Chosen tiles and the stored ones around them, on their planes."""
-    wide = chosen.clone()
-    for grid in grids:
-        here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
-        images = chosen[here].view(grid.own_tiles.shape)[:, None].float()
-        wide[here] |= (max_pool2d(images, 3, 1, 1) > 0).reshape(-1)
-    return wide & (grids[0].tiles > 0)
 
 
 def resample(

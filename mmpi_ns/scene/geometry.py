@@ -96,12 +96,6 @@ class LocalRays:
         local_origins = rotate(frames.axes, origins[:, None, :] - frames.origins)
         return LocalRays(origins, directions, local_origins, rotate(frames.axes, directions[:, None, :]))
 
-    def table(self, k: int) -> Float[Tensor, "R 6"]:
-        """Origins and directions in MPI k, or in the world for the cube behind the last MPI."""
-        if k < self.local_origins.shape[1]:
-            return torch.cat([self.local_origins[:, k], self.local_directions[:, k]], -1)
-        return torch.cat([self.origins, self.directions], -1)
-
 
 def plane_hits(
     origins: Float[Tensor, "R 3"],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -57,11 +57,6 @@ class TrainingViews:
         bounded = projects[:, 0].expand(count) & (ahead > 0.01).all(1)
         return TrainingViews(poses[:, :, 3], torch.where(bounded[:, None, None], inward, 0.0))
 
-    @cached_property
-    def digest(self) -> bytes:
-        """Equal for equal cameras."""
-        return hashlib.sha256(self.origins.numpy().tobytes() + self.inward.contiguous().numpy().tobytes()).digest()
-
     def some(self, chosen: NDArray[np.int64]) -> TrainingViews:
         """Those of the chosen images."""
         index = torch.from_numpy(chosen)
@@ -83,7 +78,8 @@ def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.d
     Returns:
         On the CPU.
     """
-    marks, count = _packed_tiles(_Key(views.digest, plan, views, torch.device(device)))
+    cameras = hashlib.sha256(views.origins.numpy().tobytes() + views.inward.contiguous().numpy().tobytes())
+    marks, count = _packed_tiles(_Key(cameras.digest(), plan, views, torch.device(device)))
     return torch.from_numpy(np.unpackbits(marks, count=count).view(bool))
 
 
@@ -119,8 +115,14 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[
     spread = torch.cat([torch.arange(len(views.origins))[i::AT_ONCE] for i in range(AT_ONCE)])
     origins = (views.origins[spread] - torch.tensor(mpi.origin, dtype=torch.float64)) @ axes.T
     normals = views.inward[spread] @ axes.T
-    along_x = _most(normals[..., 0], mpi.extent[:2], mpi.width).to(device)
-    along_y = _most(normals[..., 1], mpi.extent[2:], mpi.height).to(device)
+    u0, u1, v0, v1 = mpi.extent
+    along = []  # largest slope * tangent over the lookups that read each tile of a row, and of a column, of texels
+    for slope, low, high, size in ((normals[..., 0], u0, u1, mpi.width), (normals[..., 1], v0, v1, mpi.height)):
+        first = torch.arange(0, size, SIDE, dtype=torch.float64)
+        ends = torch.stack([first - 1 - MARGIN, first + SIDE + MARGIN]).clamp(0, size - 1)
+        tangents = low + ends * ((high - low) / (size - 1))
+        along.append((slope[..., None, None] * tangents).amax(-2).to(device))
+    along_x, along_y = along
     shift, ahead = (normals * origins[:, None]).sum(-1), normals[..., 2]
     reachable = torch.zeros(mpi.planes, along_y.shape[-1], along_x.shape[-1], dtype=torch.bool, device=device)
     for plane in range(mpi.planes):
@@ -134,11 +136,3 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[
             most = along_y[some][..., y] + (along_x[some][..., x] + rest[some][..., None])
             reachable[plane, y, x] = (most >= 0).all(1).any(0)
     return reachable
-
-
-def _most(slope: Float[Tensor, "M 4"], extent: tuple[float, ...], size: int) -> Float[Tensor, "M 4 N"]:
-    """Largest slope * tangent over the lookups that read each tile of a row or column of texels."""
-    first = torch.arange(0, size, SIDE, dtype=torch.float64)
-    ends = torch.stack([first - 1 - MARGIN, first + SIDE + MARGIN]).clamp(0, size - 1)
-    tangents = extent[0] + ends * ((extent[1] - extent[0]) / (size - 1))
-    return (slope[..., None, None] * tangents).amax(-2)

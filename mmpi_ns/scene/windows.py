@@ -65,10 +65,6 @@ class WindowedPlan:
             return self.plans[0].names
         return tuple(f"window {i}: {name}" for i, plan in enumerate(self.plans) for name in plan.names)
 
-    def first_head(self, window: int) -> int:
-        """Heads of the windows before."""
-        return sum(plan.num_heads for plan in self.plans[:window])
-
     def find(self, name: str) -> tuple[int, int] | None:
         """Window and head of one of ``names``; None for any other name."""
         heads = [(w, head) for w, plan in enumerate(self.plans) for head in range(plan.num_heads)]

@@ -125,11 +125,19 @@ class Splats(_Run):
         if dispatch.fault("C++") is not None:
             raise ValueError("Colours of splats are fitted by compiled code: install a C++ compiler (g++ or clang++).")
         scene = self.bake(details=False)  # splats do not show them
-        from mmpi_ns.export.splats import poses_in, splats_of, write_ply
+        import torch
 
-        for number, (place, window) in enumerate(scene.windows):
+        from mmpi_ns.export.splats import splats_of, write_ply
+        from mmpi_ns.scene.windows import window_shares
+
+        cameras = [pose for pose in scene.path if not pose.test]
+        centers = torch.tensor([pose.to_world for pose in cameras])[:, :, 3]
+        shares = window_shares(centers, tuple(place for place, _ in scene.windows))
+
+        for number, (_, window) in enumerate(scene.windows):
             path = self.output.with_stem(f"{self.output.stem}-{number:05d}") if len(scene.windows) > 1 else self.output
-            splats = splats_of(window, poses_in(place, scene), self.weight, self.most)
+            poses = [pose for pose, share in zip(cameras, shares[:, number].tolist(), strict=True) if share > 0]
+            splats = splats_of(window, poses, self.weight, self.most)
             size = write_ply(splats, path)
             print(f"Wrote {path}: {len(splats.means)} splats, {size / 1e6:.1f} MB.")
 

@@ -136,21 +136,21 @@ def batch_losses(
     exposure = rays.bundle.metadata.get(EXPOSURE)
     # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
     asked, size, device = len(image), len(rays.bundle) // rays.times, image.device
-    starts = size * torch.arange(rays.times, device=device)[:, None]
-    pixels = (starts + torch.arange(asked, device=device)).reshape(-1)
-    keypoints = (starts + torch.arange(asked, size, device=device)).reshape(-1)
+    every = torch.arange(rays.times * size, device=device).view(rays.times, size)
+    pixels, keypoints = every[:, :asked].reshape(-1), every[:, asked:].reshape(-1)
     image = image.repeat(rays.times, 1)
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)
     # If MPIs train separately and cover a ray only in part, they need not explain the remaining transmittance.
     explained = rays.report.explained[pixels]
     background = torch.where(explained, random, observed)
-    colors, transmittance = rays.colors.of_rays(pixels), rays.composite.transmittance.index_select(0, pixels)
-    rgb = colors.rgb + transmittance * background
+    shown = (rays.colors.rgb, rays.colors.mass, rays.colors.first, rays.colors.second, rays.composite.transmittance)
+    colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in shown)
+    rgb = colors + transmittance * background
     sums = _depth_sums(rays, field)
     total = {
         "rgb_loss": photometric(rgb, observed, None if exposure is None else exposure.index_select(0, pixels)),
-        "point_color": weight.point_color * point_color(colors.mass, colors.first, colors.second, observed),
+        "point_color": weight.point_color * point_color(mass, first, second, observed),
         "entropy": weight.background_entropy * background_entropy(transmittance),
         "distortion": weight.distortion * sums.spread.index_select(0, pixels).mean(),
     }
@@ -163,9 +163,8 @@ def batch_losses(
             sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers
         )
     if rays.lookup is not None and step % weight.tv_every == 0 and field.density.requires_grad:
-        total["tv"] = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features) * (
-            weight.tv_every / max(1, image.shape[0])
-        )
+        share = weight.tv_every / max(1, len(image))
+        total["tv"] = share * field.total_variation(rays.lookup, weight.tv_density, weight.tv_features)
     errors = ((rgb - observed).detach() ** 2).sum(-1)
     return total, errors.new_zeros(len(rays.bundle)).index_copy(0, pixels, errors)
 

@@ -13,7 +13,6 @@ from typing import Literal
 
 from mmpi_ns.utils.errors import InputError
 
-PhaseName = Literal["individual", "blend", "finetune", "joint"]
 ParameterKind = Literal["density", "features", "colour", "reliability", "camera_opt"]
 Training = Literal["two-phase", "joint"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -32,20 +33,23 @@ LONG = 1800.0
 """Seconds from which a smaller method is suggested."""
 
 
+@dataclass(eq=False)
 class TrainingLog:
-    """Prints the progress of a run.
+    """Prints the progress of a run."""
 
-    Args:
-        schedule: of the run.
-        rays: of a step after the texels have grown.
-        first: first step.
-        end: step after the last one.
-    """
-
-    def __init__(self, schedule: Schedule, rays: int, first: int, end: int) -> None:
-        self.schedule, self.rays, self.first, self.end = schedule, rays, first, end
-        self._said_at, self._said = monotonic(), first
-        self._phase = ""
+    schedule: Schedule
+    """Of the run."""
+    rays: int
+    """Of a step after the texels have grown."""
+    first: int
+    """First step."""
+    end: int
+    """Step after the last one."""
+    _said_at: float = 0.0
+    """When the last line was printed,"""
+    _said: int = 0
+    """and the steps that were done then."""
+    _phase: str = ""
 
     def note(self, step: int, rgb_loss: Tensor) -> None:
         """Called after each step with its squared colour error; prints if a line is due."""

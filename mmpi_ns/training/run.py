@@ -1,15 +1,15 @@
 """State of a training run, and its changes between two steps: window, resolution, bricks, pixels, what trains.
 
-Also the rays of a batch: moved with the poses that are refined, and assigned to MPIs in the individual phase.
+Also the rays of a batch, which move with the poses that are refined.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
@@ -21,7 +21,6 @@ from mmpi_ns.capture.ray_sources import OWN_PIXEL
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.placement.split import cameras_of
 from mmpi_ns.rendering.window_store import WindowStore
-from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training.initial import start_from_depths
@@ -74,26 +73,6 @@ def move_rays(bundle: RayBundle, poses: CameraOptimizer) -> None:
     moves_camera = bundle.metadata[OWN_PIXEL]
     bundle.origins = torch.where(moves_camera, bundle.origins, bundle.origins.detach())
     bundle.directions = torch.where(moves_camera, bundle.directions, bundle.directions.detach())
-
-
-def individual_rays(
-    bundle: RayBundle, plan: ScenePlan, rays_per_mpi: Literal["split", "all"], g: torch.Generator
-) -> tuple[RayBundle, Bool[Tensor, "R H"] | None, Float[Tensor, "R K"] | None]:
-    """Rays of the individual phase, each for one of the MPIs it meets or for every MPI in turn, and for the cube (paper
-    sec. III-C, first stage).
-
-    Returns:
-        The rays, (all) the heads that each may meet, and (split) priorities of the MPIs.
-    """
-    num_mpis, device = len(plan.mpis), bundle.origins.device
-    if num_mpis == 1:
-        return bundle, None, None
-    if rays_per_mpi == "split":
-        return bundle, None, torch.rand(len(bundle), num_mpis, generator=g, device=device)
-    heads = torch.arange(num_mpis, device=device).repeat_interleave(len(bundle))
-    mask = torch.arange(plan.num_heads, device=device) == heads[:, None]
-    mask[:, num_mpis:].fill_(True)
-    return bundle.broadcast_to((num_mpis, len(bundle))).flatten(), mask, None
 
 
 class Progress(nn.Module):

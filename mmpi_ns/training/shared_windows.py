@@ -43,7 +43,8 @@ class WindowShare:
         return {step: path for folder in self.folders for step, path in checkpoints_in(folder, steps).items()}
 
     def unfinished(self, progress: Progress, store: WindowStore) -> Iterator[int]:
-        """Windows that this process still has to train; takes over the files that the resumed run finished."""
+        """Windows that this process still has to train; takes over the files that the resumed run finished. Ends when
+        all processes have trained theirs."""
         windows = progress.windows
         for window in range(self.rank, len(windows), self.processes):
             for folder in self.folders[1:]:
@@ -55,8 +56,5 @@ class WindowShare:
                 say(f"Window {window} is finished already.")
             else:
                 yield window
-
-    def wait_for_all(self) -> None:
-        """Waits until all processes have called this."""
         if self._group is not None:
             dist.barrier(group=self._group)

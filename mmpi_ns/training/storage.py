@@ -9,9 +9,10 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from mmpi_ns.field.tables import TABLES, TexelTables
-from mmpi_ns.scene.bricks import tiles_with_copies, widened_tiles
+from mmpi_ns.scene.bricks import tiles_with_copies
 from mmpi_ns.scene.plan import FINER, MOST_TEXELS
 from mmpi_ns.scene.texels import BRICK, head_shapes
 from mmpi_ns.training.memory import Work, stored_bytes, training_bytes
@@ -117,9 +118,15 @@ def copy_finely(
     order = order[grids[0].places[order] < first_voxel]  # the cube has no copy
 
     def chosen(count: int) -> Tensor:
+        """Tiles of the first bricks, and the stored ones around them on their planes."""
         tiles = torch.zeros_like(field.tiles, dtype=torch.bool)
         tiles[grids[0].places[order[:count]]] = True
-        return widened_tiles(grids[: len(copies)], tiles)
+        wide = tiles.clone()
+        for grid in grids[: len(copies)]:
+            here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
+            images = tiles[here].view(grid.own_tiles.shape)[:, None].float()
+            wide[here] |= (max_pool2d(images, 3, 1, 1) > 0).reshape(-1)
+        return wide & (field.tiles > 0)
 
     def fits(count: int) -> bool:
         fine, kept = tiles_with_copies(grids, copies, chosen(count))

@@ -178,8 +178,12 @@ class MMPITrainer(Trainer):
 
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
-        say(self._manager.describe())
-        say(describe(plan, self._window_steps, *self._expected_memory()))
+        run, manager, windows = self._run, self._manager, plan.windows
+        work = Work(run.field.feature_channels, any(phase.name == "blend" for phase in run.progress.schedule.phases))
+        tables = [training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows]
+        cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
+        say(manager.describe())
+        say(describe(plan, self._window_steps, tables, [manager.pixel_bytes(c) for c in cameras]))
         if self._follows_capture:
             rays, times = self._manager.config.train_num_rays_per_batch, self.config.pipeline.model.rays_times  # type: ignore[attr-defined]
             say(
@@ -192,15 +196,6 @@ class MMPITrainer(Trainer):
             say(forecast(self.config.method_name or "", self._total_steps, rays, num_threads(), free_cores()))
             if gpu := unused_gpu():
                 say(f"No GPU is used: {gpu}.")
-
-    def _expected_memory(self) -> tuple[list[int], list[int]]:
-        """Bytes needed for training each window: tables with their moments, and pixels."""
-        run, manager, windows = self._run, self._manager, self._run.progress.windows.windows
-        blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
-        work = Work(run.field.feature_channels, blends)
-        tables = [training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows]
-        cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
-        return tables, [manager.pixel_bytes(c) for c in cameras]
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that follow the phases."""
@@ -227,7 +222,6 @@ class MMPITrainer(Trainer):
         if self._share is not None:
             for window in self._share.unfinished(self._run.progress, self._run.store):
                 self.train_window(window)
-            self._share.wait_for_all()
             if self._share.rank == 0:
                 self._write_details(self._total_steps - 1)
             return

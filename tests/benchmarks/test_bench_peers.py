@@ -12,7 +12,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 from trainings import Progress
 
-from mmpi_ns.capture.dataset import read_ply
+from mmpi_ns.capture.dataset import parser_points
 from mmpi_ns.ops import dispatch
 
 
@@ -69,11 +69,11 @@ def test_point_clouds_are_read_without_open3d(tmp_path):
     binary = tmp_path / "binary.ply"
     binary.write_bytes("\n".join(head).format("binary_little_endian 1.0").encode() + np.array(rows, kind).tobytes())
     for path in (text, binary):
-        xyz, rgb = read_ply(path)
+        xyz, rgb = parser_points(path, torch.eye(4)[:3], 1.0).values()
         assert xyz.tolist() == [list(r[:3]) for r in rows] and rgb.tolist() == [list(r[3:]) for r in rows]
     text.write_text("solid cube")
     with pytest.raises(ValueError, match="not a PLY file"):
-        read_ply(text)
+        parser_points(text, torch.eye(4)[:3], 1.0)
 
 
 def test_points_are_where_nerfstudio_puts_them(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from PIL import Image
 from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, write_scene
 from training_runs import datamanager, in_capture_frame
@@ -120,7 +121,9 @@ def test_exposures_travel_with_a_checkpoint_and_older_ones_have_none(manager):
     centers = torch.from_numpy(manager.observations.centers).float()
     model, other = Exposures(manager.gains, centers), Exposures(None, None)
     other.load_state_dict(model.state_dict())
-    torch.testing.assert_close(other.nearest(centers[4] + 0.01), model.factors[4])
+    place = centers[4:5] + 0.01
+    taken_nearest = other.shown("nearest", RayBundle(place, torch.zeros_like(place), place[:, :1]))
+    torch.testing.assert_close(taken_nearest, model.factors[4])
     torch.testing.assert_close(other.factors, model.factors)
     torch.testing.assert_close(other.mean, model.factors.log().mean(0).exp())
     other.load_state_dict({})

@@ -169,19 +169,19 @@ def test_a_capture_without_training_images_is_refused():
 
 def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkeypatch, capsys):
     say_once.cache_clear()
-    outputs, none = cloud_outputs(), tmp_path / "none"
+    outputs, none = cloud_outputs(), (SimpleNamespace(data=tmp_path), Path("none"))
     cameras = as_data().cameras
     waiting = read_observations(outputs, cameras, None)
     assert waiting.loose is not None and not len(waiting.points)
     assert waiting.loose == pytest.approx(np.array([[0, 0.1, -3]]), abs=1e-6)
     monkeypatch.setattr(mmpi_observations, "_find_points", lambda found, *_: found)
     data = as_data()
-    assert observe(outputs, data, none, find_points=True, triangulates=True).loose is not None
+    assert observe(outputs, data, *none, find_points=True, triangulates=True).loose is not None
     names, seen_point = np.array(outputs.image_filenames), np.zeros(2, int)
     tracks = SfmModel(np.array([[0.0, 0, -3]]), names, np.arange(2), seen_point, np.full((2, 2), 0.5))
     monkeypatch.setattr(mmpi_observations, "find_sfm_model", lambda folder: tracks)
     monkeypatch.setattr(mmpi_observations, "drop_masked", lambda found, data: found)
     say_once.cache_clear()
-    found = observe(outputs, data, none, find_points=True, triangulates=True)
+    found = observe(outputs, data, *none, find_points=True, triangulates=True)
     assert found.loose is None and len(found.points) == 1
     assert "Point cloud: not used" in capsys.readouterr().out

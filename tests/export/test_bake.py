@@ -24,7 +24,7 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering import baked as baking
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.rendered import bounded, shown_outputs
-from mmpi_ns.scene.baked import brick_numbers, columns_of
+from mmpi_ns.scene.baked import brick_numbers
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.scripts import export
 
@@ -325,13 +325,12 @@ def test_baked_codes_are_those_of_the_planes(trainer, monkeypatch, request):
     monkeypatch.setattr(baking, "AT_ONCE_BRICKS", 7)
     baked, seen = baking.bake(field, 3e-3, 0.5).mpis, 0
     assert (field.tiles == 0).any() and baked.num_bricks > 50
-    for k, mpi in enumerate(baked.mpis):
-        grid, first = field.grids[k], baked.first_column(k)
+    for k, numbers in enumerate(brick_numbers(baked.columns, baked.mpis)):
+        grid = field.grids[k]
         planes = field.density.data[grid.rows, 0].view(grid.depth, grid.height, grid.width)
         codes = baked.density_codes.encode(planes + field.layout.biases[k][:, None, None])
         features = field.features.data[grid.rows].view(grid.depth, grid.height, grid.width, -1)
         stored = (grid.rows >= 64).view(grid.depth, grid.height, grid.width)
-        numbers = brick_numbers(baked.columns[first : first + columns_of(mpi)], mpi)
         for (plane, row, column), number in zip(np.ndindex(numbers.shape), numbers.flatten().tolist(), strict=True):
             place = plane, slice(7 * row, 7 * row + 8), slice(7 * column, 7 * column + 8)
             shows = bool(stored[place].any()) and bool((codes[place] > 0).any())

@@ -13,7 +13,7 @@ from mmpi_ns.export.files import write_baked
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.baked import reader
 from mmpi_ns.ops.march import Rays
-from mmpi_ns.scene.baked import SIDE, Shader, brick_numbers, columns_from, columns_of
+from mmpi_ns.scene.baked import SIDE, Shader, brick_numbers, columns_from
 
 FORMS = ("reference", "cpu")
 
@@ -116,11 +116,10 @@ def test_peaks_are_the_largest_weights(form):
 def test_columns_find_every_brick():
     """Numbers and places of bricks survive the way through columns, beyond 32 planes and with the sign bit set."""
     window = random_window(num_mpis=1, planes=65, stored=0.7)
-    mpi = window.mpis.mpis[0]
-    numbers = brick_numbers(window.mpis.columns, mpi)
+    (numbers,) = brick_numbers(window.mpis.columns, window.mpis.mpis)
     assert sorted(numbers[numbers >= 0].tolist()) == list(range(window.mpis.num_bricks))
     columns, places = columns_from(numbers >= 0, 0)
-    assert torch.equal(columns, window.mpis.columns) and len(columns) == columns_of(mpi)
+    assert torch.equal(columns, window.mpis.columns) and len(columns) == window.mpis.first_column(1)
     assert torch.equal(numbers[tuple(places.T)], torch.arange(len(places), dtype=numbers.dtype))
     assert (window.mpis.columns[:, 0] < 0).any() and window.mpis.density.shape[1:] == (SIDE, SIDE)
 

@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from bricked import bricked_field
 from compiled import both, compiled, normal  # noqa: F401
 
+from mmpi_ns.field.tables import TexelTables
+from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import (
     Table,
     index_rows,
     interpolate,
     interpolate_densely,
     order_by_head,
-    raise_peaks,
     read_rows,
     sum_rows,
     texel_rows,
@@ -202,7 +205,9 @@ def test_a_bricks_peak_is_the_largest_weight_of_what_reads_it(taps):
             wanted[brick] = max(wanted[brick], weight)
 
     raised, index = peaks.clone(), index_rows(rows, 64 * 40)
-    raise_peaks(raised, index.unique, index.positions, weights)
+    lookup = SimpleNamespace(index=torch.arange(500), taps=[Taps(index.positions, weights)], rows=index.unique)
+    tables = SimpleNamespace(peak=raised, num_copies=1, crossings=torch.tensor(0))
+    TexelTables.note_use(tables, lookup, weights, torch.ones(500, dtype=torch.long), torch.zeros(500))
     assert torch.equal(raised, wanted) and not torch.equal(peaks, wanted)
 
 

@@ -151,8 +151,7 @@ def test_weak_features_count_where_images_have_few(tmp_path, monkeypatch, is_poo
     monkeypatch.setattr(pycolmap, "extract_features", watch)
     photos = [Photo(f"{i}.png", 640, 480) for i in range(3)]
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[600, 320, 240, 0], camera_id=1)
-    features.create_database(tmp_path / "database.db", photos, [1] * 3, [camera])
-    features.extract(tmp_path / "database.db", tmp_path / "images", photos, None, 8192, 1)
+    features.extract(tmp_path / "images", photos, ([1] * 3, [camera]), None, 8192, 1, tmp_path)
     usual = pycolmap.FeatureExtractionOptions().sift.peak_threshold
     assert asked[-1] == (3, pytest.approx(features.FAINT if is_poor else usual))
     assert min(count_features(tmp_path / "database.db")) > 50 and not (tmp_path / "sample.db").exists()

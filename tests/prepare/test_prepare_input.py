@@ -239,8 +239,8 @@ def test_look_alikes_are_found_by_their_features(tmp_path):
         corridor.write_images(tmp_path / "in" / str(seed), 2, seed=seed)
     photos = gather(tmp_path / "in", find_images(tmp_path / "in"), tmp_path)
     database = tmp_path / "database.db"
-    features.create_database(database, photos, *make_cameras(photos, "shared", {}, None, "auto"))
-    features.extract(database, tmp_path / "images", photos, None, 1000, 1)
+    cameras = make_cameras(photos, "shared", {}, None, "auto")
+    features.extract(tmp_path / "images", photos, cameras, None, 1000, 1, tmp_path)
     alike = features.image_similarity(database, 4)
     assert alike.argmax(-1).tolist() == [1, 0, 3, 2]
 

@@ -18,7 +18,6 @@ from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.bricks import (
     grown_tiles,
-    keep_bricks,
     new_table,
     read_planes,
     resample,
@@ -204,7 +203,9 @@ def test_growth_equals_dense_growth_where_everything_around_is_stored_and_goes_o
     is_cube = [False, False, True]
     full = make_grids(shapes)
     dense = new_table(full[0].tiles, 2, dtype=torch.float64).normal_(generator=torch.Generator().manual_seed(0))
-    tiles, kept = keep_bricks(full[0].tiles, chance(len(full[0].places), 0.7))
+    keep = chance(len(full[0].places), 0.7)
+    keep[0] = True
+    tiles, kept = number_tiles(keep[1:]), keep.nonzero()[:, 0]
     some, thin = make_grids(shapes, tiles), dense.view(-1, BRICK, 2)[kept].reshape(-1, 2)
     thin[:BRICK] = -20.0
     wide = make_grids(wider)

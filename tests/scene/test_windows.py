@@ -129,7 +129,7 @@ def test_shares_change_steadily_along_the_way():
 def test_a_windowed_plan_survives_json():
     plan = WindowedPlan(line_of(0.0, 2.5))
     assert WindowedPlan.from_json(plan.to_json()) == plan
-    assert plan.names[0].startswith("window 0: ") and plan.first_head(1) == 1
+    assert plan.names[0].startswith("window 0: ") and plan.plans[0].num_heads == 1
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from random_fields import random_plan
 from training_runs import datamanager, plan_of, ready, trainer_config
 
-from mmpi_ns.field.shading import RayColors
+from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.depth_sums import depth_sums
 from mmpi_ns.ops.variation import clamped_differences
@@ -53,8 +55,11 @@ def test_photometric_is_the_mean_squared_error():
 
 def point_color(colors, weights, observed):
     """The loss from samples, through the sums that a ray keeps of them."""
-    samples = RayColors.of_samples(Composite(weights, weights[:, :1], weights[:, :1]), observed, colors)
-    return losses.point_color(samples.mass, samples.first, samples.second, observed)
+    field = MMPIField(random_plan(1, False, 0), shading="sample")
+    field.get_outputs = lambda *_: {FieldHeadNames.RGB: colors}
+    composite = Composite(weights, weights[:, :1], weights[:, :1])
+    rays = field.render_colors(None, None, composite)
+    return losses.point_color(rays.mass, rays.first, rays.second, observed)
 
 
 def test_point_color_weighs_each_samples_error_by_its_weight():

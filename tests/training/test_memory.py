@@ -19,6 +19,7 @@ from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training import memory
 from mmpi_ns.training.memory import Work, describe, fit_memory, reserved_bytes, training_bytes
+from mmpi_ns.training.run import views_of
 from mmpi_ns.utils.errors import InputError
 
 
@@ -40,7 +41,10 @@ def test_memory_is_that_of_tables_moments_and_pixels(scene, plan_file, tmp_path,
     up, so two phases stay below it."""
     trainer = ready(trainer_config(scene, plan_file, tmp_path, 16, training=training))
     said = " ".join(capsys.readouterr().out.split())
-    tables, pixels = trainer._expected_memory()
+    run, manager = trainer._run, trainer._manager
+    work = Work(run.field.feature_channels, two_phase=training == "two-phase")
+    (window,), pixels = run.progress.windows.windows, [manager.pixel_bytes(None)]
+    tables = [training_bytes(window.plan, views_of(window, run.views), work, trainer.device)]
     trainer.train()
     most = max(bytes_of(load(trainer.checkpoint_dir, step)) for step in range(1, 16))
     assert most == tables[0] if training == "joint" else 0.5 * tables[0] < most <= tables[0]

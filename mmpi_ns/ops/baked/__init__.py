@@ -22,7 +22,8 @@ from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.layout import dense, frame_rows, shaped
 from mmpi_ns.ops.march import shown
 from mmpi_ns.ops.march.rays import Rays, Shown
-from mmpi_ns.scene.baked import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, columns_of, tiles_of
+from mmpi_ns.scene.baked import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, tiles_of
+from mmpi_ns.scene.geometry import Frames
 
 
 @operation()
@@ -110,12 +111,12 @@ def _pack(baked: BakedMpis) -> ctypes.Array:
     low, step = (torch.tensor([getattr(c, name) for c in baked.channel_codes]) for name in ("low", "step"))
     doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
     tables = [
-        shaped(baked.columns, sum(columns_of(m) for m in baked.mpis), 2, dtype=torch.int32),
+        shaped(baked.columns, baked.first_column(count), 2, dtype=torch.int32),
         # Sixteen channels are read at once, also those of the last texel, and four densities.
         *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (density, texels)),
         *(pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)),
     ]
-    mpis = pad(frame_rows(baked.frames), (0, 7))  # of the rest of ``SceneLayout.head_rows`` nothing is read
+    mpis = pad(frame_rows(Frames.pack(baked.mpis)), (0, 7))  # of the rest of ``SceneLayout.head_rows`` nothing is read
     return structs((count, channels, mpis, structs(*stacks), structs(through), *tables))
 
 

@@ -145,21 +145,6 @@ def sum_rows(
     return out.index_add_(0, positions.reshape(-1), each)
 
 
-def raise_peaks(
-    peaks: Float[Tensor, "K"], rows: Int[Tensor, "U"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N"]
-) -> None:
-    """Raises each brick's peak to the largest weight of the samples that read its rows, in place.
-
-    Args:
-        peaks: of all bricks.
-        rows: distinct rows.
-        positions: of the rows that each sample reads, among those.
-        weights: of the samples.
-    """
-    bricks = (rows // BRICK)[positions.reshape(-1)]
-    peaks.scatter_reduce_(0, bricks, weights.repeat_interleave(positions.shape[1]), "amax")
-
-
 def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     """table[rows] for the distinct rows of ``index_rows``; their gradient goes to the table's ``grad``."""
     return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]

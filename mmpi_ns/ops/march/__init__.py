@@ -22,7 +22,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.layout import SceneLayout, Tables, dense
+from mmpi_ns.ops.layout import Places, SceneLayout, Tables, dense
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 from mmpi_ns.scene.baked import columns_from
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
@@ -89,7 +89,7 @@ def show_rays(
     """
     m = march(layout, tables, rays, options)
     composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)
-    sums = gather_places(layout, features, m.places, composite.weights)
+    sums = gather_places(layout, features, Places(m.heads, m.planes, m.ndc, m.valid), composite.weights)
     return Shown(
         gathered=sums.gathered,
         mass=composite.weights.sum(-1, keepdim=True),
@@ -153,7 +153,10 @@ def _live_samples(
     """All live planes of every MPI, and the samples inside the cube, at fixed distances from each camera."""
     parts, frames = [], layout.frames
     for k, grid in enumerate(layout.grids):
-        numbers, index = _enumerate(counts[:, k])
+        # (ray, 0..count-1) for every sample, ray by ray.
+        numbers = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts[:, k])
+        starts = counts[:, k].cumsum(0) - counts[:, k]
+        index = torch.arange(len(numbers), device=counts.device) - starts[numbers]
         if k < len(layout.mpis):
             m, mpi = first[:, k][numbers] - index, layout.mpis[k]
             ray = torch.cat(
@@ -176,13 +179,6 @@ def _live_samples(
         tau = layout.optical_depth(k, interpolate(tables.density, *texels)[:, 0], planes)
         parts.append((numbers, torch.full_like(numbers, k), planes, ndc, inverse_t, tau))
     return LiveSamples(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
-
-
-def _enumerate(counts: Int[Tensor, "R"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"]]:
-    """(ray, 0..count-1) for every sample, ray by ray."""
-    rays = torch.repeat_interleave(torch.arange(counts.shape[0], device=counts.device), counts)
-    starts = counts.cumsum(0) - counts
-    return rays, torch.arange(rays.shape[0], device=counts.device) - starts[rays]
 
 
 # Merge ---------------------------------------------------------------------------------------------------------------
