@@ -21,6 +21,7 @@ from rich.progress import track
 from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Progress, find_depths
+from mmpi_ns.capture.moving_carry import carried
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
 from mmpi_ns.capture.moving_follow import upright_objects
 from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
@@ -44,13 +45,16 @@ ROUNDS = (2, 1)
 """Of dense matching: at half the size, then at that size."""
 AFTER = 2
 """Nearest neighbours from which objects are followed by optical flow."""
+AGAIN = ((len(RANKS), 0.0), (2, 0.03))
+"""An image is looked at again if one of so many nearest neighbours has more than this share of newly masked pixels; and
+once more."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.4
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is."""
-VERSION = 9
+VERSION = 10
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -88,10 +92,14 @@ def find_moving(
         masks = [mask for mask, _ in first]
         uprights = upright_objects(shots, near, masks, pool)
         masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
-        again = [i for i in range(len(shots)) if any(masks[j].any() for j in near[i])]
-        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i][1]), again))
-        for i, (mask, _) in zip(again, second, strict=True):
-            masks[i] = mask
+        before = [np.zeros_like(mask) for mask in masks]
+        for count, share in AGAIN:
+            has_more = [(mask & ~old).mean() > share for mask, old in zip(masks, before, strict=True)]
+            again = [i for i in range(len(shots)) if any(has_more[j] for j in near[i][:count])]
+            moves = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i][1]), again))
+            before = list(masks)
+            for i, (mask, _) in zip(again, moves, strict=True):
+                masks[i] = mask
     # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         masks = [np.zeros_like(mask) for mask in masks]
@@ -208,4 +216,5 @@ def _moves(
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow) & ~static
+        core |= carried(shot, others, [masks[j] for j in near]) & ~static
     return grown(shot, shown, core | uprights), first
