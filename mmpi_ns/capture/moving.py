@@ -45,12 +45,9 @@ ROUNDS = (2, 1)
 """Of dense matching: at half the size, then at that size."""
 AFTER = 2
 """Nearest neighbours from which objects are followed by optical flow."""
-AGAIN = ((len(RANKS), 0.0), (2, 0.03))
-"""An image is looked at again if one of so many nearest neighbours has more than this share of newly masked pixels; and
-once more."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
-SECONDS = 0.4
+SECONDS = 0.5
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is."""
@@ -92,14 +89,10 @@ def find_moving(
         masks = [mask for mask, _ in first]
         uprights = upright_objects(shots, near, masks, pool)
         masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
-        before = [np.zeros_like(mask) for mask in masks]
-        for count, share in AGAIN:
-            has_more = [(mask & ~old).mean() > share for mask, old in zip(masks, before, strict=True)]
-            again = [i for i in range(len(shots)) if any(has_more[j] for j in near[i][:count])]
-            moves = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i][1]), again))
-            before = list(masks)
-            for i, (mask, _) in zip(again, moves, strict=True):
-                masks[i] = mask
+        again = [i for i in range(len(shots)) if any(masks[j].any() for j in near[i])]
+        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i][1]), again))
+        for i, (mask, _) in zip(again, second, strict=True):
+            masks[i] = mask
     # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         masks = [np.zeros_like(mask) for mask in masks]
