@@ -241,7 +241,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     flow.setVariationalRefinementIterations(0)
     flow.setGradientDescentIterations(ITERATIONS)
     flow.setPatchStride(STRIDE[is_large])
-    rough, depth = rough_inverse_depth(view, points), None
+    rough, depth = rough_inverse_depth(view.reduced(rounds[0]) if rounds else view, points), None
     surfaces = None if rounds else search_surfaces(view, others, rough)
     if surfaces is not None:
         depth = Depth(surfaces.inverse, surfaces.error)
