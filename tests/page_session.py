@@ -87,8 +87,8 @@ def main(load_config: Path, cameras: int = 5, least: float = 0.003) -> None:
                 first_db = metrics(first, truth)["psnr"]
                 print(
                     f"{test.image_filenames[i].name}: {close[-1]:.1f} dB to the baked scene in Python; exact "
-                    f"{ours:.2f}, baked {stored:.2f}, page {theirs:.2f} dB; the first picture {early[-1]:.1f} dB to exact, "
-                    f"{first_db:.2f} dB"
+                    f"{ours:.2f}, baked {stored:.2f}, page {theirs:.2f} dB; "
+                    f"the first picture {early[-1]:.1f} dB to exact, {first_db:.2f} dB"
                 )
             assert not tab.messages, tab.messages
     print(f"at least {min(close):.1f} dB to the baked scene")
