@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from mmpi_ns.capture.patches import search_surfaces
+from mmpi_ns.capture.patches import Surfaces, search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
@@ -65,6 +65,9 @@ SAME_DEPTH = 0.03
 """The depths of a point in two images agree within this fraction plus three of their errors."""
 MAX_RELATIVE = 0.15
 """Depths with a larger relative error are discarded."""
+AROUND, MEASURED = 1 / 20, 0.5
+"""Side of the square about a pixel, as a fraction of the longer side of the image, and the share of measured pixels in
+it from which on planes add no depth: what is missing there are edges and leaves, which no plane passes through."""
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
 TRIMMED = 8
@@ -232,7 +235,7 @@ def _tasks(
 
 def matched(view: View, others: list[View], points: NDArray[np.float64], rounds: Sequence[int] | None = None) -> Depth:
     """The depths of a view by comparison with other views: planes at a low resolution, then optical flow, and planes
-    again where that gives nothing. ``rounds`` of optical flow alone, if there are any."""
+    again where that gives hardly anything. ``rounds`` of optical flow alone, if there are any."""
     if not others or min(view.gray.shape) < SMALLEST:
         return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
@@ -256,10 +259,15 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
         pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]
         depth = without_fringes(small, fuse(*zip(*pairs, strict=True)))
     assert depth is not None
-    if surfaces is None:
-        return depth
-    is_measured, (inverse, error) = depth.inverse > 0, surfaces.without_edges().enlarged(view.gray.shape)
-    return Depth(np.where(is_measured, depth.inverse, inverse), np.where(is_measured, depth.error, error))
+    return depth if surfaces is None else filled(depth, surfaces)
+
+
+def filled(depth: Depth, surfaces: Surfaces) -> Depth:
+    """Measured depths, and those of planes where hardly any is measured."""
+    is_measured, (inverse, error) = depth.inverse > 0, surfaces.without_edges().enlarged(depth.inverse.shape)
+    side = 2 * int(max(is_measured.shape) * AROUND / 2) + 1
+    is_bare = ~is_measured & (_mean(is_measured.astype(np.float32), side) < MEASURED)
+    return Depth(np.where(is_bare, inverse, depth.inverse), np.where(is_bare, error, depth.error))
 
 
 def pulled(rough: Map, depth: Depth) -> Map:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from value_noise import noise
 
-from mmpi_ns.capture.dense import ROUNDS, Depth, confirmed, matched
+from mmpi_ns.capture.dense import ROUNDS, Depth, confirmed, filled, matched
 from mmpi_ns.capture.patches import Surfaces, search_surfaces
 from mmpi_ns.capture.views import View
 
@@ -138,3 +138,16 @@ def test_images_of_any_size_are_matched(size):
     small = [View(np.zeros(size, np.uint8), np.array([9.0, 9, 4, 4]), v.pose, np.ones(size, bool)) for v in views()]
     depth = matched(small[0], small[1:], few_points(0))
     assert isinstance(depth, Depth) and depth.inverse.shape == size and not depth.inverse.any()
+
+
+def test_planes_fill_what_is_bare_and_not_the_gaps_between_measured_depths():
+    measured = np.zeros((60, 100), np.float32)
+    measured[:, :50] = 2.0
+    measured[20:23, 20:23] = 0  # side of the square: 5 pixels
+    planes = np.zeros((30, 50, 3), np.float32)
+    planes[..., 0] = 1.0
+    depth = filled(Depth(measured, 0.1 * measured), Surfaces(planes, np.full((30, 50), 0.2, np.float32)))
+    assert (depth.inverse[:, :50] == measured[:, :50]).all() and (
+        depth.error[:, :50] == np.float32(0.1) * measured[:, :50]
+    ).all()
+    assert (depth.inverse[:, 50:] == 1).all() and (depth.error[:, 50:] == np.float32(0.2)).all()
