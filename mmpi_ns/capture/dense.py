@@ -3,7 +3,7 @@
 Every image is compared with its nearest neighbours. A rough depth, from SfM points and planes searched at a low
 resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by DIS
 optical flow, is small. A match on its epipolar line gives an inverse depth; consistent matches of several neighbours
-are averaged; where there are none, the planes' depths remain. Threads share the images (OpenCV and NumPy release
+are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV and NumPy release
 Python's lock), and an image is in memory only while its neighbours are worked on.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
@@ -67,7 +67,7 @@ MAX_RELATIVE = 0.15
 """Depths with a larger relative error are discarded."""
 AROUND, MEASURED = 1 / 20, 0.5
 """Side of the square about a pixel, as a fraction of the longer side of the image, and the share of measured pixels in
-it from which on planes add no depth: what is missing there are edges and leaves, which no plane passes through."""
+it from which on planes add no depth: in gaps between matches they made pictures worse (docs/log/experiments.md)."""
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
 TRIMMED = 8
