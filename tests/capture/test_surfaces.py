@@ -151,3 +151,18 @@ def test_planes_fill_what_is_bare_and_not_the_gaps_between_measured_depths():
         depth.error[:, :50] == np.float32(0.1) * measured[:, :50]
     ).all()
     assert (depth.inverse[:, 50:] == 1).all() and (depth.error[:, 50:] == np.float32(0.2)).all()
+
+
+def test_what_one_of_several_neighbours_shows_has_depths():
+    """The walls at the border of the last image but one: images further in have passed them."""
+    (view, inverse), others = corridor(1), [corridor(i)[0] for i in (0, 2, 3)]
+    surfaces = search_surfaces(view, others, np.full(inverse.shape, np.median(inverse), np.float32))
+    assert surfaces is not None
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    # A step further in, at this depth, they are outside of the image.
+    ahead = 1 / inverse - STEP
+    passed = (ahead <= 0) | (
+        np.maximum(np.abs(x) / WIDTH, np.abs(y) / HEIGHT) / inverse / np.maximum(ahead, 1e-9) > 0.5
+    )
+    right = np.abs(surfaces.enlarged(inverse.shape)[0] / inverse - 1) < 0.1
+    assert passed.mean() > 0.1 and right[passed].mean() > 0.15, (passed.mean(), right[passed].mean())
