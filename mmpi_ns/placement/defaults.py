@@ -22,7 +22,7 @@ class Default:
 
 
 DEFAULTS = {
-    "mmpi": Default(20000, 4096, PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6)),
+    "mmpi": Default(20000, 4096, PlacementConfig(texel_pixels=1.2, max_texels=200e6)),
     "mmpi-small": Default(4000, 1024, PlacementConfig(texel_pixels=1.0)),
 }
 PIXELS = 6.5e6

@@ -47,7 +47,7 @@ class PlacementConfig:
     """Minimum gain of an MPI in bits: how often it must halve the expected error of one training image (automatic)."""
     planes: int = 64
     """Planes of every MPI (drive, room)."""
-    max_planes: int = 128
+    max_planes: int = 256
     """Maximum planes of an MPI; each gets as many as the points it serves need (automatic)."""
     plane_pixels: float = 0.5
     """Plane error allowed for four fifths of the points of an MPI, relative to a texel's pixels (automatic)."""
