@@ -45,7 +45,7 @@ def _method(
     optimizers: dict = {kind: TouchedAdamConfig(lr=lr) for kind, lr in rates.items()}
     optimizers["camera_opt"] = AdamOptimizerConfig(lr=POSE_RATE, eps=1e-15)
     if paper:  # from DVGO: total variation and nine features; and a network evaluated for every sample
-        model.loss = LossWeights(tv_density=1e-5, tv_features=1e-6)
+        model.loss = LossWeights(tv_density=1e-5, tv_features=1e-6, tv_chroma=0.0)
         model.colour = ColourConfig(shading="sample", feature_channels=9)
     config = MMPITrainerConfig(
         method_name=name,

@@ -21,7 +21,7 @@ from mmpi_ns.field.shading import ColorNetworks, RayColors, RayShader, Shading
 from mmpi_ns.field.tables import TexelTables
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
-from mmpi_ns.ops.gather import Taps, gather_places, gather_taps
+from mmpi_ns.ops.gather import COLORS, Taps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.shade import SampleNetworks, shade
@@ -241,16 +241,29 @@ class MMPIField(TexelTables):
         rgb = self.networks.shade(sums.gathered, mass, composite.accumulation, directions)
         return RayColors(rgb, sums.mass, sums.first, sums.second)
 
-    def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
-        """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""
+    def total_variation(
+        self, lookup: Lookup, density_weight: float, feature_weight: float, chroma_times: float = 0.0
+    ) -> Tensor:
+        """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray).
+
+        Args:
+            lookup: of the batch.
+            density_weight: of densities.
+            feature_weight: of colours and features.
+            chroma_times: how many times more than they already do differences of chroma count in the gradient.
+        """
         total, scales = self.density.new_zeros(()), []
+        features = lookup.features
+        if chroma_times > 0 and features.requires_grad:
+            features = features.view_as(features)  # a node of its own: the hook sees this loss's gradient alone
+            features.register_hook(lambda gradient: with_chroma(gradient, chroma_times))
         for k, grid in enumerate(self.grids):
             side = max(grid.width, grid.height)
             sides = (side, side, grid.depth) if k < len(self.plan.mpis) else (grid.width, grid.height, grid.depth)
             scales.append((sides[0] / 128, sides[1] / 128, sides[2] / 128))
         for table, values, weight in (
             (self.density, lookup.density, density_weight),
-            (self.features, lookup.features, feature_weight),
+            (self.features, features, feature_weight),
         ):
             if weight > 0:
                 total = total + weight * total_variation(values, table.data, lookup.rows, self.layout, scales)
@@ -265,6 +278,13 @@ class MMPIField(TexelTables):
         inverse_t = metadata_of(ray_samples)["inverse_t"].reshape(-1)[lookup.index]
         samples = (lookup.rays, local, inverse_t, lookup.heads)
         return log_shares(self.layout, self.reliability, self.touched, *samples)
+
+
+def with_chroma(gradient: Float[Tensor, "U C"], times: float) -> Float[Tensor, "U C"]:
+    """A gradient of features, its chroma (three colours less their mean) ``times`` times more in it."""
+    colors = gradient[:, :COLORS]
+    chroma = colors - colors.mean(-1, keepdim=True)
+    return torch.cat([colors + times * chroma, gradient[:, COLORS:]], -1)
 
 
 def moving(

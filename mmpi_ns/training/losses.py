@@ -21,6 +21,8 @@ CLIPPED = 0.98
 """Colour of an image above which a channel may be clipped."""
 PLANE_ERROR = 0.6
 """Minimum error of a known depth, in plane spacings."""
+TV_EVERY = 4
+"""Total variation is added every this many steps, with its weight multiplied by the same number."""
 KEYPOINT_WIDTH = 0.06
 """Standard deviation of the window round an SfM keypoint, relative to its inverse distance."""
 
@@ -46,8 +48,9 @@ class LossWeights:
     """Total variation of the densities, in DVGO's normalisation (there: 1e-5)."""
     tv_features: float = 1e-5
     """Total variation of the features, in the same normalisation (there: 1e-6)."""
-    tv_every: int = 4
-    """Total variation is added every this many steps, with its weight multiplied by the same number."""
+    tv_chroma: float = 50.0
+    """Weight of differences of chroma (a texel's colour less the mean of its channels), as a multiple of
+    ``tv_features``: few rays leave colours that waver, and surfaces change hue less than brightness."""
 
 
 def photometric(
@@ -162,9 +165,9 @@ def batch_losses(
         total["known_depth"] = weight.known_depth * known_depth(
             sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers
         )
-    if rays.lookup is not None and step % weight.tv_every == 0 and field.density.requires_grad:
-        share = weight.tv_every / max(1, len(image))
-        total["tv"] = share * field.total_variation(rays.lookup, weight.tv_density, weight.tv_features)
+    if rays.lookup is not None and step % TV_EVERY == 0 and field.density.requires_grad:
+        variation = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features, weight.tv_chroma)
+        total["tv"] = TV_EVERY / max(1, len(image)) * variation
     errors = ((rgb - observed).detach() ** 2).sum(-1)
     return total, errors.new_zeros(len(rays.bundle)).index_copy(0, pixels, errors)
 

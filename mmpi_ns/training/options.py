@@ -61,7 +61,7 @@ RANGES = {
         "direction_frequencies": Number(0, 32, whole=True),
     },
     "pipeline.model.rendering": {"threshold": SHARE, "resident_gib": NOT_NEGATIVE, "nearest_images": COUNT},
-    "pipeline.model.loss": {f.name: NOT_NEGATIVE for f in fields(LossWeights)} | {"tv_every": Number(1, whole=True)},
+    "pipeline.model.loss": {f.name: NOT_NEGATIVE for f in fields(LossWeights)},
 }
 """Values of the options that a run can use, by the options' group."""
 NO_EFFECT = {
@@ -87,7 +87,7 @@ RENAMED = {
 """Names of the model's options before they were in groups, where the name has changed."""
 LEFT = {"blend_form": "paper", "shared_colour": False, "render_shares": "exact"}
 """Options that this version may lack, with the value that it stands for."""
-TRAINED = {"growing_rays"}
+TRAINED = {"growing_rays", "tv_every"}
 """Options that this version lacks and that changed the training alone."""
 
 

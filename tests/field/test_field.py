@@ -251,6 +251,24 @@ def test_total_variation_is_the_sum_over_touched_texels_and_their_neighbours(wit
     assert np.allclose(field.density.dense_grad()[:, 0].numpy(), gradient, atol=1e-6)
 
 
+def test_differences_of_chroma_count_more_in_the_gradient_of_features_alone():
+    field = fill(MMPIField(ScenePlan((make_mpi("a", height=3, width=4, planes=3),), None, 0.05, 1.0)), seed=8)
+    samples, gradients = sampled(field, bundle([[0, 0, 0]], [[-0.4, -0.15, 0.9]])), []
+    for times in (0.0, 7.0):
+        field.zero_grad(set_to_none=True)
+        _, lookup = field.get_density(samples)
+        lookup.density.retain_grad(), lookup.features.retain_grad()
+        (3 * field.total_variation(lookup, 1.0, 1.0, times) + lookup.features.sum()).backward()
+        gradients.append((lookup.density.grad, lookup.features.grad.double()))
+    (density, plain), (same_density, weighted) = gradients
+    assert torch.equal(density, same_density) and plain.shape[1] > 3
+    for before, after in zip((plain - 1).tolist(), (weighted - 1).tolist(), strict=True):
+        mean = sum(before[:3]) / 3
+        expected = [x + 7 * (x - mean) for x in before[:3]] + before[3:]
+        assert after == pytest.approx(expected, abs=1e-5)
+    assert (weighted - plain)[:, :3].abs().max() > 0.01
+
+
 def test_a_batch_without_samples_has_no_variation_and_no_density(plan):
     field = MMPIField(plan)
     tau, lookup = field.get_density(sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]])))

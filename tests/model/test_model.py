@@ -17,6 +17,7 @@ from training_runs import plan_of, ready, trainer_config, write_plan
 import mmpi_ns.model
 from mmpi_ns import model as mmpi_model
 from mmpi_ns.config import mmpi_small
+from mmpi_ns.training.losses import TV_EVERY
 from mmpi_ns.training.phases import TRAINS
 
 KINDS = ("density", "features", "colour", "reliability")
@@ -81,10 +82,9 @@ def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file,
 
 def test_total_variation_is_added_every_few_steps_while_densities_train(scene, plan_file, tmp_path):
     trainer = trainer_of(scene, plan_file, tmp_path)
-    every = trainer.config.pipeline.model.loss.tv_every
     blend = trainer.pipeline.model.progress.schedule.phases[1].start
-    assert [("tv" in run_step(trainer, s)[1]) for s in (0, 1, every)] == [True, every == 1, True]
-    assert "tv" not in run_step(trainer, -(-blend // every) * every)[1]
+    assert [("tv" in run_step(trainer, s)[1]) for s in (0, 1, TV_EVERY)] == [True, False, True]
+    assert "tv" not in run_step(trainer, -(-blend // TV_EVERY) * TV_EVERY)[1]
 
 
 def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_file, tmp_path):

@@ -51,7 +51,6 @@ REFUSED = {
     M + "schedule__decay_decades": [NAN],
     M + "schedule__decay_from": [1.5],
     M + "loss__distortion": [NAN, -1.0],
-    M + "loss__tv_every": [0],
     "machine__device_type": ["mps"],
 }
 PARSER = {
