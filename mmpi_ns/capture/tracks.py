@@ -81,7 +81,7 @@ def size_of(file: Path) -> NDArray[np.float64]:
     try:
         with Image.open(file) as image:
             return np.array(image.size, np.float64)
-    except OSError as error:
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(
             f"Training image {file} cannot be read ({brief(error)}): repair it or remove its frame."
         ) from error
