@@ -22,7 +22,7 @@ from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.capture.new_views import image_and_mask
 from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
-from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
+from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, has_details, moved_cameras, write_details
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
@@ -227,7 +227,7 @@ class MMPITrainer(Trainer):
             return
         self._began = monotonic()
         if self._start_step >= self._total_steps:
-            say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do.")
+            self._go_on_after_last_step()
             return
 
         def stop(number: int) -> None:  # nerfstudio's loop ends after the current step, even if training is paused
@@ -296,15 +296,36 @@ class MMPITrainer(Trainer):
         writer.write_out_storage()
         if self._stopped_by is not None or self._share is not None:
             return
-        self._write_details(self.step)
-        seconds = monotonic() - self._began
-        say(f"Training finished: {self._last_step + 1 - self._start_step:,} steps in {duration(seconds)}.")
-        images = self._manager.eval_dataset
-        if self._says_lines and images is not None:
-            say(quick_test(self.pipeline.model, images))
-        say(next_commands(self.base_dir))
+        self._complete()
         if not self.config.viewer.quit_on_train_completion:
-            self._train_complete_viewer()
+            with signals_go_to(lambda _: sys.exit()):  # as nerfstudio says here
+                self._train_complete_viewer()
+
+    def _complete(self) -> None:
+        """What follows the last step: details, a quick test and the next commands."""
+        last, folder = checkpoints_in(self.checkpoint_dir).get(self._last_step), quoted(self.checkpoint_dir)
+        end = (
+            f"Stopped after the last step, which is in {last}: the same command with --load-dir {folder} makes details."
+        )
+        with signals_go_to(lambda number: _end(number, end)):
+            self._write_details(self._last_step)
+            if steps := self._last_step + 1 - self._start_step:
+                say(f"Training finished: {steps:,} steps in {duration(monotonic() - self._began)}.")
+            images = self._manager.eval_dataset
+            if self._says_lines and images is not None:
+                say(quick_test(self.pipeline.model, images))
+        say(next_commands(self.base_dir))
+
+    def _go_on_after_last_step(self) -> None:
+        """Makes the details that a finished run in this folder lacks, as it was stopped meanwhile."""
+        model, self._last_step = cast(Any, self.pipeline.model), self._start_step - 1
+        is_whole = self._start_step > self._total_steps or self._last_step not in checkpoints_in(self.checkpoint_dir)
+        is_whole |= not model.config.rendering.nearest_images
+        is_whole = is_whole or has_details(self.base_dir / DETAILS_FOLDER, self._last_step)
+        left = "nothing to do" if is_whole else "details of its training images are made"
+        say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
+        if not is_whole:
+            self._complete()
 
     def _write_details(self, step: int) -> None:
         """Keeps what the trained field lacks in its training images, if it is to be shown, as it is from now on."""

@@ -13,6 +13,9 @@ import torch
 import yaml
 from forked import run, start, start_train, train
 from tiny_scene import TEST, name_of, write_scene
+from training_runs import ready, trainer_config
+
+from mmpi_ns.training.trainer import MMPITrainer
 
 LONG = {"max_num_iterations": 100_000, "steps_per_save": 100_000}
 
@@ -67,6 +70,32 @@ def test_a_run_that_is_stopped_before_it_trains_says_so(whole_scene, tmp_path):
     ended = running.end()
     assert ended.status == 130 and "Traceback" not in ended.out + ended.error
     assert ended.error.strip().splitlines()[-1].startswith("Stopped")
+
+
+def test_a_run_that_is_stopped_after_its_last_step_says_how_its_details_are_made(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(MMPITrainer, "_write_details", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit) as ended:
+        ready(trainer_config(scene, None, tmp_path, 2)).train()
+    said = capsys.readouterr().err
+    assert ended.value.code == 130 and "Stopped after the last step, which is in" in said and "step-000000001" in said
+
+
+def test_details_that_a_stopped_run_lacks_are_made_when_it_goes_on(whole_scene, finished, tmp_path):
+    shutil.rmtree(finished / "details")
+    again = {"load_dir": finished / "nerfstudio_models", "max_num_iterations": 6}
+    said = train(whole_scene, tmp_path, **again).shown
+    assert "already holds 6 of 6 steps: details of its training images are made" in said and "ns-eval" in said
+    assert "no details" not in evaluate(finished, tmp_path).shown
+    assert "nothing to do" in train(whole_scene, tmp_path, **again).shown
+
+
+def test_one_ctrl_c_closes_the_viewer_of_a_finished_run(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(MMPITrainer, "_train_complete_viewer", lambda _: signal.raise_signal(signal.SIGINT))
+    config = trainer_config(scene, None, tmp_path, 2)
+    config.viewer.quit_on_train_completion = False
+    with pytest.raises(SystemExit) as ended:
+        ready(config).train()
+    assert ended.value.code is None
 
 
 def test_a_stopped_run_goes_on_in_its_folder(whole_scene, tmp_path):
