@@ -124,6 +124,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def create_train_dataset(self) -> MMPIDataset:
         # First, so that what is wrong with the test images is said before minutes of matching.
         self._test_images = super().create_eval_dataset()
+        if self.test_mode == "val":
+            self._test_images.check_files()
         self.train_dataset = dataset = super().create_train_dataset()
         if min(int(dataset.cameras.width.min()), int(dataset.cameras.height.min())) < 1:
             raise InputError(

@@ -93,11 +93,20 @@ class MMPIDataset(InputDataset):
                 else:
                     pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         except UNREADABLE as error:
-            raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.") from error
+            raise _unreadable(name, error) from error
         if self.scale_factor == 1.0:
             return pixels
         size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
         return np.array(Image.fromarray(pixels).resize(size, resample=Image.Resampling.BILINEAR))
+
+    def check_files(self) -> None:
+        """Raises InputError naming an image file that is missing or no image, by its first bytes alone."""
+        for name in self.image_filenames:
+            try:
+                with Image.open(name):
+                    pass
+            except UNREADABLE as error:
+                raise _unreadable(name, error) from error
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where any image has one."""
@@ -145,6 +154,10 @@ class MMPIDataset(InputDataset):
         if self.moving is not None:
             return ~self.moving[image_idx]
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
+
+
+def _unreadable(name: Path, error: Exception) -> InputError:
+    return InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.")
 
 
 def read_mask(file: Path, scale: float) -> Bool[Tensor, "H W 1"]:

@@ -213,7 +213,11 @@ def test_what_another_data_parser_cannot_read_is_one_sentence(tmp_path, parser, 
 
 
 def test_missing_test_images_are_named_before_the_training_images_are_matched(tmp_path, capsys):
-    data = write_scene(tmp_path / "data")
+    data = write_scene(tmp_path / "data", sfm=False)
+    (data / "images" / name_of(TEST[1])).unlink()
+    with pytest.raises(InputError, match=f"Image .*{name_of(TEST[1])} cannot be read"):
+        datamanager(data)
+    (data / "colmap").mkdir()
     parser = blender(data)
     (data / "transforms_val.json").unlink()
     with pytest.raises(InputError, match=r"cannot read the val images .*transforms_val.json"):
