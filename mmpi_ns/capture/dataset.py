@@ -311,12 +311,14 @@ class LocalColmap(ColmapDataParser):
         outputs = super()._generate_dataparser_outputs(split, **kwargs)
         return with_cameras_of_copies(self._origin.tell(outputs), self._downscale_factor)
 
-    def _setup_downscale_factor(self, image_filenames: list[Path], *others: list[Path]) -> Any:
+    def _setup_downscale_factor(
+        self, image_filenames: list[Path], mask_filenames: list[Path], depth_filenames: list[Path]
+    ) -> Any:
         first, factor = image_filenames[0], self.config.downscale_factor
         if self._downscale_factor is None and not first.is_file() and hasattr(self, "downscale_factor"):
             self._downscale_factor = factor or 1  # rendering needs no images, which nerfstudio tells its other parsers
         try:
-            return super()._setup_downscale_factor(image_filenames, *others)
+            return super()._setup_downscale_factor(image_filenames, mask_filenames, depth_filenames)
         except EOFError as error:  # it asks on the terminal whether to make copies, and nobody answers
             folder, factor = self.config.data / self.config.images_path, self._downscale_factor
             copies = names_of_copies(folder.parent)
