@@ -27,15 +27,13 @@ from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.rays import lens_directions
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model, numbers_in_model
-from mmpi_ns.capture.tracks import PosedImages, at_full_size, triangulate
+from mmpi_ns.capture.tracks import SAME_PLACE, PosedImages, at_full_size, triangulate
 from mmpi_ns.capture.views import Map, project
 from mmpi_ns.placement.observations import Observations, add_swept_points
 from mmpi_ns.utils.errors import InputError, quoted
 
 Array = NDArray[np.float64]
 
-SAME_PLACE = 1e-6
-"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
 MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
 POSES_OFF = 0.5

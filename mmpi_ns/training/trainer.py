@@ -101,6 +101,8 @@ class MMPITrainerConfig(TrainerConfig):
         not which checkpoint this run resumes from, which they must not load.
         """
         check_run(self)
+        if comms.get_world_size() == 1:  # processes that share windows look for those of each
+            checkpoint_to_load(self)
         folder = self.get_base_dir()
         claim(folder, self.get_checkpoint_dir(), self.load_checkpoint or self.load_dir)
         self.pipeline.model.windows_folder = folder / WINDOWS_FOLDER  # type: ignore[attr-defined]

@@ -235,6 +235,7 @@ def test_no_checkpoint_is_said(whole_scene, finished, tmp_path):
     (finished / "nerfstudio_models" / "step-000000005.ckpt").unlink()
     assert "There is no checkpoint in" in evaluate(finished, tmp_path).sentence
     assert "There is no checkpoint in" in train(whole_scene, tmp_path / "n", load_dir=finished).sentence
+    assert not (tmp_path / "n").exists()  # nothing was begun: matching may take minutes
 
 
 def test_a_step_that_is_not_there_is_said(whole_scene, trained, tmp_path):
@@ -308,6 +309,15 @@ def test_mmpi_export_names_the_option_that_cannot_be_used(trained, tmp_path, opt
     place = ("--load-config", trained / "config.yml", "--output", tmp_path / "out")
     assert run("mmpi-export", "bake", *place, option, value).sentence.startswith(f"{option} must be")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("format", "name"), [("bake", "out"), ("splats", "out/scene.ply")])
+def test_mmpi_export_names_a_folder_that_cannot_be_written_before_it_bakes(trained, tmp_path, format, name):
+    (tmp_path / "notes.txt").write_text("a file")
+    place = ("--load-config", trained / "config.yml", "--output", tmp_path / "notes.txt" / name)
+    ended = run("mmpi-export", format, *place)
+    assert "notes.txt/out cannot be written" in ended.sentence and "choose another --output" in ended.sentence
+    assert "Loading" not in ended.out
 
 
 @pytest.mark.parametrize("text", ["", "hello", "a: [1,"])
