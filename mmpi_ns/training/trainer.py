@@ -339,7 +339,7 @@ class MMPITrainer(Trainer):
         cameras = moved_cameras(images.cameras.to(model.device), model.camera_optimizer)
         render = model.get_outputs_for_camera_ray_bundle
         say(write_details(folder, step, cameras, model.exposures.factors, partial(image_and_mask, images), render))
-        model.details = details_of(folder, step)
+        model.details = details_of(folder, step) if has_details(folder, step) else None
 
     # Checkpoints --------------------------------------------------------------------------------------------------
 
