@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import shutil
 import sys
 from contextlib import nullcontext
@@ -33,6 +32,7 @@ from mmpi_ns.training.checkpoints import (
     checkpoints_in,
     claim,
     read_checkpoint,
+    write_plan,
 )
 from mmpi_ns.training.learning_rates import PhaseScheduler
 from mmpi_ns.training.memory import Work, describe, training_bytes
@@ -153,7 +153,7 @@ class MMPITrainer(Trainer):
             config.max_num_iterations = self._window_steps
             plan = self._run.progress.windows
             self.base_dir.mkdir(parents=True, exist_ok=True)
-            _write_plan(self.base_dir / PLAN_FILE, plan)
+            write_plan(self.base_dir / PLAN_FILE, plan)
             self._run.shared = self._share is not None
             if len(self._run.field.density) <= BRICK:  # the empty brick alone
                 raise InputError(
@@ -398,20 +398,6 @@ class MMPITrainer(Trainer):
             progress = run.progress
             finished = dict(enumerate(progress.windows.plans[: progress.schedule.window_at(self._start_step)]))
             run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
-
-
-def _write_plan(path: Path, plan: WindowedPlan) -> None:
-    """Writes a run's plan for the user to read. Raises InputError if the user has edited the present file."""
-    text, digest_file = plan.to_json(), path.with_name(f".{path.name}.sha256")
-    present = path.read_bytes() if path.is_file() else text.encode()
-    digest = digest_file.read_text(encoding="ascii") if digest_file.is_file() else ""
-    if present != text.encode() and hashlib.sha256(present).hexdigest() != digest:
-        raise InputError(
-            f"{path} is not the plan of this run and was edited, it seems: give it with --pipeline.model.plan-file in "
-            "another --timestamp, or remove it."
-        )
-    write_atomically(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
-    digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
 
 
 def _end(number: int, sentence: str = "Stopped before the first step: there is nothing to go on from.") -> NoReturn:
