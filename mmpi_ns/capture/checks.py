@@ -87,10 +87,9 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
             raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
         copy = path.parent / f"images_{factor}" / first.name
         if factor > 1 and not copy.is_file():
-            copies = ", ".join(sorted(p.name for p in path.parent.glob("images_*") if p.is_dir())) or "no copies"
             raise InputError(
                 f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give "
-                f"another --downscale-factor (there are {copies})."
+                f"another --downscale-factor (there are {names_of_copies(path.parent)})."
             )
     elif opens:
         try:
@@ -101,11 +100,16 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
                 f"Image {first} cannot be read ({brief(error)}): repair it or remove its frame."
             ) from error
     names = [str(frame["file_path"]) for frame in frames]
-    _check_places(poses[:, :3, 3], names, path, auto_scale=parser.auto_scale_poses)
+    check_places(poses[:, :3, 3], names, path, "nerfstudio-data", auto_scale=parser.auto_scale_poses)
     files = [str(frame[key]) for frame in frames for key in PATHS if key in frame]
     outside = [n for n in files if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
     if outside:
         say_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
+
+
+def names_of_copies(folder: Path) -> str:
+    """Names of a capture's folders of downscaled copies, for a sentence."""
+    return ", ".join(sorted(p.name for p in folder.glob("images_*") if p.is_dir())) or "no copies"
 
 
 @cache
@@ -229,14 +233,27 @@ def _check_whole_file(
             )
 
 
-def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path, *, auto_scale: bool) -> None:
-    """Camera positions must differ, and none may be far from all others."""
+def check_places(
+    centers: NDArray[np.float64], names: Sequence[str], path: Path, parser: str, *, auto_scale: bool
+) -> None:
+    """Camera positions [M, 3] in a file must differ, and none may be far from all others.
+
+    Args:
+        centers: the positions.
+        names: of the images.
+        path: the file or model, for the sentence.
+        parser: name of the data parser on the command line.
+        auto_scale: the parser divides by their extent.
+
+    Raises:
+        InputError: they do not.
+    """
     if np.ptp(centers, axis=0).max() <= FLOAT64_SAME * max(1.0, np.abs(centers).max()):
         if not auto_scale:
             return
         raise InputError(
             f"All {len(centers)} camera(s) of {path} stand in one place, so no distance can be learned: give images "
-            "from two places, or learn colours alone (nerfstudio-data --auto-scale-poses False)."
+            f"from two places, or learn colours alone ({parser} --auto-scale-poses False)."
         )
     off = np.linalg.norm(centers - np.median(centers, axis=0), axis=-1)
     count, last = len(off), int(off.argmax())
@@ -244,7 +261,7 @@ def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path
     if usual > 0 and off[last] > FAR_OFF * usual:
         raise InputError(
             f"The camera of frame {cut(names[last])} of {path} stands {off[last]:.3g} from the others, which "
-            f"lie within {usual:.3g}: correct its transform_matrix or remove the frame."
+            f"lie within {usual:.3g}: correct its pose or remove the frame."
         )
 
 

@@ -122,6 +122,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         super().__init__(config, **kwargs)
 
     def create_train_dataset(self) -> MMPIDataset:
+        # First, so that what is wrong with the test images is said before minutes of matching.
+        self._test_images = super().create_eval_dataset()
+        if self.test_mode == "val":
+            self._test_images.check_files()
         self.train_dataset = dataset = super().create_train_dataset()
         if min(int(dataset.cameras.width.min()), int(dataset.cameras.height.min())) < 1:
             raise InputError(
@@ -171,9 +175,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         )
 
     def create_eval_dataset(self) -> MMPIDataset:
-        dataset = super().create_eval_dataset()
-        if len(dataset):
-            return dataset
+        if len(self._test_images):
+            return self._test_images
         say("The capture has no test images: scores are of training images, and say nothing about new views.")
         return self.dataset_type(self.train_dataparser_outputs, scale_factor=self.config.camera_res_scale_factor)
 

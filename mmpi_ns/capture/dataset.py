@@ -7,27 +7,28 @@ without open3d, which is often missing or lacks system libraries.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Bool
 from nerfstudio.data.dataparsers import nerfstudio_dataparser
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+from nerfstudio.data.dataparsers.scannet_dataparser import ScanNet
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from mmpi_ns.capture.checks import say_once
+from mmpi_ns.capture.checks import check_places, names_of_copies, say_once
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
@@ -92,11 +93,20 @@ class MMPIDataset(InputDataset):
                 else:
                     pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         except UNREADABLE as error:
-            raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.") from error
+            raise _unreadable(name, error) from error
         if self.scale_factor == 1.0:
             return pixels
         size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
         return np.array(Image.fromarray(pixels).resize(size, resample=Image.Resampling.BILINEAR))
+
+    def check_files(self) -> None:
+        """Raises InputError naming an image file that is missing or no image, by its first bytes alone."""
+        for name in self.image_filenames:
+            try:
+                with Image.open(name):
+                    pass
+            except UNREADABLE as error:
+                raise _unreadable(name, error) from error
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where any image has one."""
@@ -106,7 +116,7 @@ class MMPIDataset(InputDataset):
             data["mask"] = torch.from_numpy(self.usable(image_idx))[..., None]
         elif file is not None:
             try:
-                data["mask"] = mask = get_image_mask_tensor_from_path(file, self.scale_factor)
+                data["mask"] = mask = read_mask(file, self.scale_factor)
                 if mask.shape[:2] != shape:
                     raise ValueError(f"it has {mask.shape[1]} x {mask.shape[0]} pixels")
             except UNREADABLE as error:
@@ -144,6 +154,23 @@ class MMPIDataset(InputDataset):
         if self.moving is not None:
             return ~self.moving[image_idx]
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
+
+
+def _unreadable(name: Path, error: Exception) -> InputError:
+    return InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.")
+
+
+def read_mask(file: Path, scale: float) -> Bool[Tensor, "H W 1"]:
+    """Where a mask is not black, at a multiple of its size. Raises ValueError if it has colour channels."""
+    with Image.open(file) as image:
+        gray = image.convert("L") if image.mode == "P" else image  # the numbers of a palette are no shades
+        if scale != 1.0:
+            width, height = (int(side * scale) for side in gray.size)
+            gray = gray.resize((width, height), resample=Image.Resampling.NEAREST)
+        shades = np.array(gray)
+    if shades.ndim != 2:
+        raise ValueError("it has several channels")
+    return torch.from_numpy(shades != 0)[..., None]
 
 
 def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
@@ -245,14 +272,16 @@ class LocalNerfstudio(Nerfstudio):
 
     def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
         origin = self._origin.place if self._origin.taken else 0.0
-        try:
-            points = parser_points(ply_file_path, transform_matrix, scale_factor, origin)
-        except InputError as error:
-            say_once(f"[bold yellow]{error} Training goes on without the point cloud.")
-            return None
-        if points is None:
-            say_once(f"[bold yellow]The point cloud {ply_file_path} holds no point: training goes on without it.")
-        return points
+        return _points_or_none(ply_file_path, transform_matrix, scale_factor, origin)
+
+
+class LocalScanNet(ScanNet):
+    """nerfstudio's parser of ScanNet's folders, whose default for the point cloud is a file of its author."""
+
+    def _load_3D_points(
+        self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float, points_color: bool
+    ) -> Any:
+        return _points_or_none(ply_file_path, transform_matrix, scale_factor) if ply_file_path.is_file() else None
 
 
 class LocalColmap(ColmapDataParser):
@@ -262,7 +291,16 @@ class LocalColmap(ColmapDataParser):
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
         with checked_model(recon_dir):
-            meta = super()._get_all_images_and_cameras(recon_dir)
+            try:
+                meta = super()._get_all_images_and_cameras(recon_dir)
+            except NotImplementedError as error:
+                raise InputError(
+                    f"The lens of {recon_dir} cannot be used ({brief(error)}): undistort the images with COLMAP's "
+                    "image_undistorter, and use the images and the model that it writes."
+                ) from error
+        centers = np.array([frame["transform_matrix"] for frame in meta["frames"]])[:, :3, 3]
+        names = [frame["file_path"] for frame in meta["frames"]]
+        check_places(centers, names, recon_dir, "colmap", auto_scale=self.config.auto_scale_poses)
         self._origin = LocalOrigin(meta, recon_dir)
         return meta
 
@@ -273,16 +311,72 @@ class LocalColmap(ColmapDataParser):
         outputs = super()._generate_dataparser_outputs(split, **kwargs)
         return with_cameras_of_copies(self._origin.tell(outputs), self._downscale_factor)
 
+    def _setup_downscale_factor(
+        self, image_filenames: list[Path], mask_filenames: list[Path], depth_filenames: list[Path]
+    ) -> Any:
+        first, factor = image_filenames[0], self.config.downscale_factor
+        if self._downscale_factor is None and not first.is_file() and hasattr(self, "downscale_factor"):
+            self._downscale_factor = factor or 1  # rendering needs no images, which nerfstudio tells its other parsers
+        try:
+            return super()._setup_downscale_factor(image_filenames, mask_filenames, depth_filenames)
+        except EOFError as error:  # it asks on the terminal whether to make copies, and nobody answers
+            folder, factor = self.config.data / self.config.images_path, self._downscale_factor
+            copies = names_of_copies(folder.parent)
+            raise InputError(
+                f"There are no copies of {folder} at 1/{factor} of their size: make them (mmpi-prepare does) or "
+                f"give another --downscale-factor after colmap (there are {copies}; 1 takes the images themselves)."
+            ) from error
+
     def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
         return {}  # in float32; ``find_sfm_model`` reads the model's points and tracks in float64
 
 
-TARGETS: dict[type, type] = {Nerfstudio: LocalNerfstudio, ColmapDataParser: LocalColmap}
+TARGETS: dict[Any, type] = {Nerfstudio: LocalNerfstudio, ColmapDataParser: LocalColmap, ScanNet: LocalScanNet}
 
 
 def take_local_origins(config: DataParserConfig) -> None:
-    """Makes a parser's settings build the one that reads map coordinates, if there is one."""
-    config._target = TARGETS.get(config._target, config._target)
+    """Makes a parser's settings build the one that reads map coordinates, if there is one; errors are a sentence."""
+    if not isinstance(config._target, partial):
+        config._target = partial(_with_sentences, TARGETS.get(config._target, config._target))  # type: ignore
+
+
+def _with_sentences(target: type[DataParser], config: DataParserConfig) -> DataParser:
+    """A parser whose own errors, which often name neither folder nor remedy, are an ``InputError``."""
+
+    @contextmanager
+    def named(what: str) -> Iterator[None]:
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as error:  # any, of any parser
+            raise InputError(
+                f"nerfstudio's data parser {target.__name__.removeprefix('Local')} cannot read {what} of {config.data} "
+                f"({type(error).__name__}: {brief(error)}): check --data, the files there and the parser's options."
+            ) from error
+
+    with named("the files"):
+        parser = target(config)
+    read = parser.get_dataparser_outputs
+
+    def get_dataparser_outputs(split: str = "train", **kwargs: Any) -> DataparserOutputs:
+        with named(f"the {split} images"):
+            return read(split, **kwargs)
+
+    parser.get_dataparser_outputs = get_dataparser_outputs  # type: ignore[method-assign]
+    return parser
+
+
+def _points_or_none(*how: Any) -> dict[str, Tensor] | None:
+    """``parser_points``, and None with a warning where there are none."""
+    try:
+        points = parser_points(*how)
+    except InputError as error:
+        say_once(f"[bold yellow]{error} Training goes on without the point cloud.")
+        return None
+    if points is None:
+        say_once(f"[bold yellow]The point cloud {how[0]} holds no point: training goes on without it.")
+    return points
 
 
 def parser_points(

@@ -26,16 +26,14 @@ from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.rays import lens_directions
-from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
-from mmpi_ns.capture.tracks import PosedImages, at_full_size, triangulate
+from mmpi_ns.capture.sfm import SfmModel, find_sfm_model, numbers_in_model
+from mmpi_ns.capture.tracks import SAME_PLACE, PosedImages, at_full_size, triangulate
 from mmpi_ns.capture.views import Map, project
 from mmpi_ns.placement.observations import Observations, add_swept_points
 from mmpi_ns.utils.errors import InputError, quoted
 
 Array = NDArray[np.float64]
 
-SAME_PLACE = 1e-6
-"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
 MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
 POSES_OFF = 0.5
@@ -176,7 +174,7 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
         return observations
     transform = outputs.dataparser_transform.double().numpy()
     points = (sfm.points @ transform[:3, :3].T + transform[:3, 3]) * outputs.dataparser_scale
-    tracked = with_tracks(observations, replace(sfm, points=points), [Path(p).name for p in outputs.image_filenames])
+    tracked = with_tracks(observations, replace(sfm, points=points), outputs.image_filenames)
     if not len(tracked.seen_at):
         return tracked
     angles = keypoint_angles(tracked, cameras)
@@ -221,12 +219,11 @@ def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImage
     return PosedImages(files, *cameras, distortion=lens.double().numpy(), fisheye=is_fisheye.numpy())
 
 
-def with_tracks(observations: Observations, model: SfmModel, names: Sequence[str] | None = None) -> Observations:
-    """The observations with the points of a model in their frame; images are named by their indices unless ``names``
+def with_tracks(observations: Observations, model: SfmModel, files: Sequence[Path] | None = None) -> Observations:
+    """The observations with the points of a model in their frame; images are named by their indices unless ``files``
     are given."""
-    number = {name: m for m, name in enumerate(model.names.tolist())}
     count = len(observations.centers)
-    images = np.array([number.get(name, -1) for name in names or map(str, range(count))], np.int64)
+    images = numbers_in_model(files or [Path(str(i)) for i in range(count)], model.names.tolist())
     begins, ends = (np.searchsorted(model.seen_by, images, side) for side in ("left", "right"))
     order = np.concatenate([np.zeros(0, np.int64), *map(np.arange, begins, ends)])
     seen_by = np.repeat(np.arange(count), ends - begins)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import signal
 import struct
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ class SfmModel:
     points: NDArray[np.float64]
     """[P, 3] in the model's frame."""
     names: NDArray[np.str_]
-    """[M] image file names."""
+    """[M] image names: file names, with folders where the images are in several."""
     seen_by: NDArray[np.int64]
     """[Q] image of each keypoint."""
     seen_point: NDArray[np.int64]
@@ -105,9 +106,35 @@ def read_reconstruction(model: pycolmap.Reconstruction, min_track: int = MIN_TRA
                 x, y = p.xy
                 keypoints.append((m, row[p.point3D_id], x / camera.width, y / camera.height))
     table = np.array(keypoints, dtype=np.float64).reshape(-1, 4)
-    names = np.array([Path(image.name).name for image in images], dtype=np.str_)
+    names = np.array([image.name for image in images], dtype=np.str_)
     seen_by, seen_point = table[:, :2].astype(np.int64).T
     return SfmModel(points, names, seen_by, seen_point, table[:, 2:])
+
+
+def numbers_in_model(files: Sequence[Path], names: Sequence[str]) -> NDArray[np.int64]:
+    """Which image of a model each file is: the one whose name, with all its folders, the path ends with.
+
+    Without one, a file name that the model has once will do, as images may have been moved. Cameras of a rig have files
+    of the same names in their folders: a model's image that several files would be is none of them.
+
+    Args:
+        files: paths of image files.
+        names: of the model's images.
+
+    Returns:
+        Numbers in ``names``, -1 where none fits. [F]
+    """
+    whole = {name: m for m, name in enumerate(names)}
+    often = Counter(Path(name).name for name in names)
+    moved = {Path(name).name: m for m, name in enumerate(names) if often[Path(name).name] == 1}
+
+    def number(file: Path) -> int:
+        endings = ("/".join(file.parts[i:]) for i in range(len(file.parts)))
+        return next((whole[ending] for ending in endings if ending in whole), moved.get(file.name, -1))
+
+    numbers = {file: number(file) for file in map(Path, files)}
+    claims = Counter(numbers.values())
+    return np.array([numbers[file] if claims[numbers[file]] == 1 else -1 for file in map(Path, files)], np.int64)
 
 
 class _Reader:

@@ -28,6 +28,8 @@ NEIGHBOURS = 8
 """Maximum number of images that each image is matched with: the nearest with a similar viewing direction."""
 SMALL, LARGE = 800, 1600
 """Images up to the first size are doubled to find fine features; images above the second are reduced to it."""
+SAME_PLACE = 1e-6
+"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
 MAX_ANGLE = 60.0
 """Maximum angle in degrees between the viewing directions of matched images."""
 MIN_TRACK = 2
@@ -81,7 +83,7 @@ def size_of(file: Path) -> NDArray[np.float64]:
     try:
         with Image.open(file) as image:
             return np.array(image.size, np.float64)
-    except OSError as error:
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(
             f"Training image {file} cannot be read ({brief(error)}): repair it or remove its frame."
         ) from error
@@ -225,13 +227,18 @@ def _epipolar_error(database: Path, model: Any) -> float:
     """Median distance of the verified matches from the epipolar lines of a model's poses, relative to the width.
 
     Unlike reprojection errors of points it is not truncated: matches that fit the poses badly never become points.
+    Images of one place have no epipolar lines; NaN without others.
     """
     pycolmap, distances = load_pycolmap(), []
     cameras = {i: model.cameras[image.camera_id] for i, image in model.images.items()}
     with pycolmap.Database.open(database) as opened:
         keypoints = {i: np.asarray(opened.read_keypoints(i), np.float64).reshape(-1, 6)[:, :2] for i in model.images}
     rays = {i: np.asarray(cameras[i].cam_from_img(points)) for i, points in keypoints.items()}
+    centers = {i: image.projection_center() for i, image in model.images.items()}
+    least = SAME_PLACE * max(1.0, float(np.abs(list(centers.values())).max()))
     for a, b, matches in matching.verified_matches(database):
+        if np.linalg.norm(centers[a] - centers[b]) <= least:
+            continue
         distance = matching.epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
         distances.append(distance * cameras[a].mean_focal_length() / cameras[a].width)
     return float(np.median(np.concatenate(distances))) if sum(map(len, distances)) else np.nan

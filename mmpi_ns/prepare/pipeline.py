@@ -337,8 +337,8 @@ class Preparation:
 @contextmanager
 def only_one(work: Path) -> Iterator[None]:
     """Locks a work folder against a second run. Raises InputError if one is at work there, or the disk is full."""
-    work.mkdir(parents=True, exist_ok=True)
     try:
+        work.mkdir(parents=True, exist_ok=True)
         with FileLock(work / "lock", blocking=False):
             yield
     except Timeout as error:
@@ -346,9 +346,12 @@ def only_one(work: Path) -> Iterator[None]:
     except InputError:
         raise
     except (OSError, RuntimeError, ValueError) as error:
-        free = shutil.disk_usage(work.parent).free
+        free = shutil.disk_usage(next(p for p in work.parents if p.is_dir())).free
         if getattr(error, "errno", None) in FULL or free < LEFT:
             says = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
+            raise InputError(says) from error
+        if isinstance(error, OSError):
+            says = f"{error.filename or work} cannot be read or written ({error.strerror or error}): check the path."
             raise InputError(says) from error
         raise
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -164,6 +165,13 @@ def _damaged(path: Path, error: Exception) -> InputError:
         f"{path} is damaged ({brief(error)}): remove the folder {path.parent}, and images show the field alone, or "
         "train again."
     )
+
+
+def has_details(folder: Path, step: int) -> bool:
+    """Whether a folder holds the details that belong to the checkpoint of a step."""
+    with suppress(InputError):  # damaged
+        return (folder / CAMERAS_FILE).is_file() and read_details(folder)[0] == step
+    return False
 
 
 def details_of(folder: Path | None, step: int) -> Details | None:

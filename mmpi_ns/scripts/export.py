@@ -12,6 +12,7 @@ import tyro
 
 from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.errors import quoted
+from mmpi_ns.utils.files import write_errors
 from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
@@ -30,8 +31,13 @@ class _Run:
     """Replace an existing export."""
 
     def check_paths(self, output: Path, is_file: bool = False) -> None:
-        """Raises ValueError if there is no run, it has no checkpoint, or there is something that an export would not
-        replace."""
+        """Checks the options and makes the folder to write.
+
+        Raises:
+            ValueError: an option is out of range, there is no run, it has no checkpoint, there is something that an
+                export would not replace, or the folder cannot be written.
+        """
+        check_options(self, {"least": Number(0, 1), "compare": Number(0, whole=True)}, "--")
         if not self.load_config.is_file():
             raise ValueError(f"There is no run at {self.load_config}: give the config.yml that ns-train wrote.")
         folder = self.load_config.parent / "nerfstudio_models"
@@ -47,10 +53,12 @@ class _Run:
                 raise ValueError(f"{output} holds other files: name an empty folder, or one that does not exist.")
             if not self.overwrite:
                 raise ValueError(f"{output} holds an export already: name another folder, or give --overwrite.")
+        folder = output.parent if is_file else output
+        with write_errors(folder, "--output"):  # now, not after minutes of baking
+            folder.mkdir(parents=True, exist_ok=True)
 
     def bake(self, details: bool = True) -> BakedScene:
         """Bakes the run's scene, with details or its field alone, and prints the loss of quality."""
-        check_options(self, {"least": Number(0, 1), "compare": Number(0, whole=True)}, "--")
         # Slow imports, not needed for --help and errors.
         from mmpi_ns.export.bake import bake_run, compare, load_model
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import shutil
 import sys
 from contextlib import nullcontext
@@ -22,7 +21,7 @@ from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.capture.new_views import image_and_mask
 from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
-from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
+from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, has_details, moved_cameras, write_details
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
@@ -33,6 +32,7 @@ from mmpi_ns.training.checkpoints import (
     checkpoints_in,
     claim,
     read_checkpoint,
+    write_plan,
 )
 from mmpi_ns.training.learning_rates import PhaseScheduler
 from mmpi_ns.training.memory import Work, describe, training_bytes
@@ -101,6 +101,8 @@ class MMPITrainerConfig(TrainerConfig):
         not which checkpoint this run resumes from, which they must not load.
         """
         check_run(self)
+        if comms.get_world_size() == 1:  # processes that share windows look for those of each
+            checkpoint_to_load(self)
         folder = self.get_base_dir()
         claim(folder, self.get_checkpoint_dir(), self.load_checkpoint or self.load_dir)
         self.pipeline.model.windows_folder = folder / WINDOWS_FOLDER  # type: ignore[attr-defined]
@@ -151,7 +153,7 @@ class MMPITrainer(Trainer):
             config.max_num_iterations = self._window_steps
             plan = self._run.progress.windows
             self.base_dir.mkdir(parents=True, exist_ok=True)
-            _write_plan(self.base_dir / PLAN_FILE, plan)
+            write_plan(self.base_dir / PLAN_FILE, plan)
             self._run.shared = self._share is not None
             if len(self._run.field.density) <= BRICK:  # the empty brick alone
                 raise InputError(
@@ -227,7 +229,7 @@ class MMPITrainer(Trainer):
             return
         self._began = monotonic()
         if self._start_step >= self._total_steps:
-            say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do.")
+            self._go_on_after_last_step()
             return
 
         def stop(number: int) -> None:  # nerfstudio's loop ends after the current step, even if training is paused
@@ -296,15 +298,36 @@ class MMPITrainer(Trainer):
         writer.write_out_storage()
         if self._stopped_by is not None or self._share is not None:
             return
-        self._write_details(self.step)
-        seconds = monotonic() - self._began
-        say(f"Training finished: {self._last_step + 1 - self._start_step:,} steps in {duration(seconds)}.")
-        images = self._manager.eval_dataset
-        if self._says_lines and images is not None:
-            say(quick_test(self.pipeline.model, images))
-        say(next_commands(self.base_dir))
+        self._complete()
         if not self.config.viewer.quit_on_train_completion:
-            self._train_complete_viewer()
+            with signals_go_to(lambda _: sys.exit()):  # as nerfstudio says here
+                self._train_complete_viewer()
+
+    def _complete(self) -> None:
+        """What follows the last step: details, a quick test and the next commands."""
+        last, folder = checkpoints_in(self.checkpoint_dir).get(self._last_step), quoted(self.checkpoint_dir)
+        end = (
+            f"Stopped after the last step, which is in {last}: the same command with --load-dir {folder} makes details."
+        )
+        with signals_go_to(lambda number: _end(number, end)):
+            self._write_details(self._last_step)
+            if steps := self._last_step + 1 - self._start_step:
+                say(f"Training finished: {steps:,} steps in {duration(monotonic() - self._began)}.")
+            images = self._manager.eval_dataset
+            if self._says_lines and images is not None:
+                say(quick_test(self.pipeline.model, images))
+        say(next_commands(self.base_dir))
+
+    def _go_on_after_last_step(self) -> None:
+        """Makes the details that a finished run in this folder lacks, as it was stopped meanwhile."""
+        model, self._last_step = cast(Any, self.pipeline.model), self._start_step - 1
+        is_whole = self._start_step > self._total_steps or self._last_step not in checkpoints_in(self.checkpoint_dir)
+        is_whole |= not model.config.rendering.nearest_images
+        is_whole = is_whole or has_details(self.base_dir / DETAILS_FOLDER, self._last_step)
+        left = "nothing to do" if is_whole else "details of its training images are made"
+        say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
+        if not is_whole:
+            self._complete()
 
     def _write_details(self, step: int) -> None:
         """Keeps what the trained field lacks in its training images, if it is to be shown, as it is from now on."""
@@ -316,7 +339,7 @@ class MMPITrainer(Trainer):
         cameras = moved_cameras(images.cameras.to(model.device), model.camera_optimizer)
         render = model.get_outputs_for_camera_ray_bundle
         say(write_details(folder, step, cameras, model.exposures.factors, partial(image_and_mask, images), render))
-        model.details = details_of(folder, step)
+        model.details = details_of(folder, step) if has_details(folder, step) else None
 
     # Checkpoints --------------------------------------------------------------------------------------------------
 
@@ -375,20 +398,6 @@ class MMPITrainer(Trainer):
             progress = run.progress
             finished = dict(enumerate(progress.windows.plans[: progress.schedule.window_at(self._start_step)]))
             run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
-
-
-def _write_plan(path: Path, plan: WindowedPlan) -> None:
-    """Writes a run's plan for the user to read. Raises InputError if the user has edited the present file."""
-    text, digest_file = plan.to_json(), path.with_name(f".{path.name}.sha256")
-    present = path.read_bytes() if path.is_file() else text.encode()
-    digest = digest_file.read_text(encoding="ascii") if digest_file.is_file() else ""
-    if present != text.encode() and hashlib.sha256(present).hexdigest() != digest:
-        raise InputError(
-            f"{path} is not the plan of this run and was edited, it seems: give it with --pipeline.model.plan-file in "
-            "another --timestamp, or remove it."
-        )
-    write_atomically(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
-    digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
 
 
 def _end(number: int, sentence: str = "Stopped before the first step: there is nothing to go on from.") -> NoReturn:

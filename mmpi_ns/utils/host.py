@@ -56,15 +56,16 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def _show_errors() -> Iterator[None]:
-    """sys.excepthook: an InputError ends a command with its sentence alone."""
+    """sys.excepthook: an InputError ends a command with its sentence alone, and Ctrl-C with a word."""
     before = sys.excepthook
 
     def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if os.environ.get(TRACEBACK) == "1" or not issubclass(kind, InputError):
+        if os.environ.get(TRACEBACK) == "1" or not issubclass(kind, (InputError, KeyboardInterrupt)):
             before(kind, error, traceback)
             return
         sys.stdout.flush()
-        print(f"{Path(sys.argv[0]).stem}: {error}", file=sys.stderr, flush=True)
+        said = error if issubclass(kind, InputError) else "Interrupted."
+        print(f"{Path(sys.argv[0]).stem}: {said}", file=sys.stderr, flush=True)
 
     sys.excepthook = show
     yield

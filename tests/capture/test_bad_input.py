@@ -121,6 +121,24 @@ def test_a_mask_that_does_not_fit_is_named(tmp_path, i, damage):
     refusal(lambda: datamanager(data), path, "cannot be used", "one channel of the image's size")
 
 
+@pytest.mark.parametrize("kind", ["palette", "16 bits", "1 bit", "0 and 1"])
+def test_masks_of_other_kinds_hide_the_same_half(tmp_path, kind):
+    data = write_scene(tmp_path / "masked", masks=True)
+    for i in range(8):
+        path = data / "masks" / name_of(i)
+        with Image.open(path) as image:
+            shades = np.array(image)
+        if kind == "palette":  # whose first colour is white
+            mask = Image.fromarray((shades == 0).astype(np.uint8), "P")
+            mask.putpalette([255, 255, 255, 0, 0, 0])
+        else:
+            numbers = {"16 bits": shades.astype(np.uint16) * 257, "1 bit": shades > 0, "0 and 1": shades // 255}
+            mask = Image.fromarray(numbers[kind])
+        mask.save(path)
+    usable = datamanager(data).train_dataset.usable(0)
+    assert usable[:, : WIDTH // 2].all() and not usable[:, WIDTH // 2 :].any()
+
+
 # Points --------------------------------------------------------------------------------------------------------------
 
 

@@ -23,7 +23,7 @@ from mmpi_ns.capture.observe import (
     tell_poses,
     with_tracks,
 )
-from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
+from mmpi_ns.capture.sfm import SfmModel, find_sfm_model, numbers_in_model
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
 
@@ -58,6 +58,15 @@ def as_data(kind=CameraType.PERSPECTIVE, lens=None, **more):
 
 
 LENS = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [1.1, 1.2, 1.3, 1.4, 1.5, 1.6]])  # nerfstudio's k1 k2 k3 k4 p1 p2
+
+
+def test_images_of_a_rig_are_told_apart_by_their_folders():
+    rig = ["left/1.png", "right/1.png", "left/2.png"]
+    files = [Path("/data/images_2") / name for name in ("right/1.png", "left/2.png", "left/1.png")]
+    assert numbers_in_model(files, rig).tolist() == [1, 2, 0]
+    assert numbers_in_model([Path("images/2.png"), Path("images/1.png")], rig).tolist() == [2, -1]  # moved: one 2.png
+    assert numbers_in_model(files, ["1.png", "2.png"]).tolist() == [-1, 1, -1]  # two would be 1.png
+    assert numbers_in_model([files[0]] * 2, rig).tolist() == [1, 1]  # a frame that is listed twice
 
 
 def test_each_camera_of_a_mixture_has_its_own_lens_and_others_are_none():

@@ -10,7 +10,9 @@ import pytest
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
+from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.scannet_dataparser import ScanNetDataParserConfig
 from PIL import Image
 from tiny_scene import FOCAL, HEIGHT, TEST, TRAIN, WIDTH, color_of, name_of, pixel_rays, pose_of, write_scene
 from training_runs import datamanager, in_capture_frame, ready, trainer_config
@@ -125,11 +127,24 @@ def blender(data, alpha_color="white"):
     return BlenderDataParserConfig(alpha_color=alpha_color)
 
 
+def scannet(data):
+    """ScanNet's folders, with depths along the optical axis in millimetres."""
+    for name in ("color", "depth", "pose", "intrinsic"):
+        (data / name).mkdir()
+    camera = [[FOCAL, 0, WIDTH / 2, 0], [0, FOCAL, HEIGHT / 2, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    np.savetxt(data / "intrinsic/intrinsic_color.txt", camera)
+    for i in range(8):
+        np.savetxt(data / f"pose/{i}.txt", pose_of(i) @ np.diag([1, -1, -1, 1]))
+        Image.open(data / "images" / name_of(i)).save(data / f"color/{i}.png")
+        Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16)).save(data / f"depth/{i}.png")
+    return ScanNetDataParserConfig(train_split_fraction=0.75)
+
+
 def transparent(data):
     return blender(data, alpha_color=None)
 
 
-SCENES = (plain, lens, fisheye, several_sizes, masks, colmap, blender, transparent)
+SCENES = (plain, lens, fisheye, several_sizes, masks, colmap, blender, scannet, transparent)
 
 
 @pytest.fixture(scope="module", params=SCENES, ids=lambda f: f.__name__)
@@ -154,7 +169,7 @@ def test_every_pixel_drawn_has_the_colour_that_its_ray_meets(capture):
     error = np.abs(found[:, :3] - wanted).max(-1)
     # A pixel on the wall's very edge may fall on the other side of it.
     assert np.sort(error)[-3] < 0.02 and seen.any()
-    if kind in (blender, transparent):
+    if kind in (blender, scannet, transparent):
         assert not manager.observations.seen_at.size
     else:
         assert len(rays) == 64 + 16 and len(manager.observations.seen_at) > 60
@@ -181,3 +196,30 @@ def test_the_only_test_image_of_instant_ngp_is_named(tmp_path):
         datamanager(data, dataparser=InstantNGPDataParserConfig(train_split_fraction=0.8))
     two = datamanager(data, dataparser=InstantNGPDataParserConfig(train_split_fraction=0.7))
     assert two.eval_dataset.cameras.shape == (2,)
+
+
+@pytest.mark.parametrize(
+    ("parser", "what"),
+    [
+        (BlenderDataParserConfig(), "Blender cannot read the train images .*transforms_train.json"),
+        (InstantNGPDataParserConfig(eval_mode="filename"), "InstantNGP .*ValueError: frame should contain train/eval"),
+        (MinimalDataParserConfig(), "MinimalDataParser cannot read the train images .*train.npz"),
+    ],
+)
+def test_what_another_data_parser_cannot_read_is_one_sentence(tmp_path, parser, what):
+    data = write_scene(tmp_path / "data")
+    with pytest.raises(InputError, match=f"nerfstudio's data parser {what}.*check --data, the files there and"):
+        datamanager(data, dataparser=parser)
+
+
+def test_missing_test_images_are_named_before_the_training_images_are_matched(tmp_path, capsys):
+    data = write_scene(tmp_path / "data", sfm=False)
+    (data / "images" / name_of(TEST[1])).unlink()
+    with pytest.raises(InputError, match=f"Image .*{name_of(TEST[1])} cannot be read"):
+        datamanager(data)
+    (data / "colmap").mkdir()
+    parser = blender(data)
+    (data / "transforms_val.json").unlink()
+    with pytest.raises(InputError, match=r"cannot read the val images .*transforms_val.json"):
+        datamanager(data, dataparser=parser)
+    assert "matching" not in capsys.readouterr().out

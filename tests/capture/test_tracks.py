@@ -199,6 +199,13 @@ def test_disturbed_poses_show_in_the_matches_and_exact_ones_do_not(images, model
     assert off is not None and 0.6 < off * WIDTH < 2
 
 
+def test_poses_of_one_place_are_not_told_to_be_off(tmp_path):
+    """Images of one place have no epipolar lines: any match would be infinitely far from them."""
+    turned = scene_of(tmp_path, [pose_at(0.0, 0.02), pose_at(0.0, 0.05)])
+    assert np.ptp(turned.camera_to_worlds[:, :, 3], axis=0).max() == 0
+    assert np.isnan(triangulate(turned).off)
+
+
 def test_equal_images_give_equal_tracks(images, model):
     again = triangulate(images)
     assert all(np.array_equal(x, vars(again)[name]) for name, x in vars(model).items())

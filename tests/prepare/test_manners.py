@@ -78,6 +78,13 @@ def test_a_second_run_into_a_scene_says_so_and_ends(frames, tmp_path):
         pass  # free again
 
 
+def test_a_scene_that_cannot_be_written_is_one_sentence(tmp_path):
+    (tmp_path / "notes.txt").write_text("a file")
+    with pytest.raises(InputError, match=r"notes.txt.* cannot be read or written \(Not a directory\): check the path"):
+        with only_one(tmp_path / "notes.txt" / "scene" / WORK):
+            pass
+
+
 def test_a_full_disk_is_called_a_full_disk(frames, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -19,6 +19,7 @@ from mmpi_ns.prepare.images import (
     gather,
     gather_masks,
     make_cameras,
+    open_image,
     parse_camera,
     read_intrinsics,
     reads_heif,
@@ -318,6 +319,13 @@ def test_truncated_image_is_named(tmp_path):
     (tmp_path / "in/b.jpg").write_bytes(save(tmp_path / "whole.jpg", (90, 90)).read_bytes()[:300])
     with pytest.raises(InputError, match=r"b\.jpg cannot be read"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
+
+
+def test_an_image_that_pillow_takes_for_an_attack_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 30)
+    Image.new("RGB", (9, 9)).save(tmp_path / "huge.png")
+    with pytest.raises(InputError, match=r"huge.png cannot be read \(Image size \(81 pixels\)"):
+        open_image(tmp_path / "huge.png")
 
 
 def test_blank_images_are_refused(tmp_path):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 
 import pytest
 from forked import run, train
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from tiny_scene import WIDTH
+from training_runs import datamanager
 
 
 @pytest.fixture
@@ -80,6 +84,11 @@ def test_a_colmap_model_of_text_that_was_cut_short_is_named(data, tmp_path, name
     assert "The COLMAP model in" in train(data, tmp_path, memory=2 << 30).sentence
 
 
+def train_colmap(data, tmp_path, *parser):
+    options = ("--output-dir", tmp_path, "--machine.device-type", "cpu", "--vis", "tensorboard")
+    return run("ns-train", "mmpi-small", "--data", data, *options, "colmap", *parser)
+
+
 @pytest.mark.parametrize("cut_to", [0.4, None])
 def test_the_colmap_parser_names_a_model_that_is_missing_or_cut_short(data, tmp_path, cut_to):
     folder = data / "colmap/sparse/0"
@@ -87,6 +96,31 @@ def test_the_colmap_parser_names_a_model_that_is_missing_or_cut_short(data, tmp_
         folder.rename(tmp_path / "elsewhere")
     else:
         cut("images.txt", cut_to)(folder)
-    options = ("--output-dir", tmp_path, "--machine.device-type", "cpu", "--vis", "tensorboard")
-    said = run("ns-train", "mmpi-small", "--data", data, *options, "colmap").sentence
+    said = train_colmap(data, tmp_path).sentence
     assert f"COLMAP model {'in' if cut_to else 'at'} {folder}" in said
+
+
+def test_the_colmap_parser_without_copies_asks_nobody(data, tmp_path):
+    said = train_colmap(data, tmp_path, "--downscale-factor", 2).sentence
+    assert f"no copies of {data / 'images'} at 1/2" in said and "there are no copies; 1 takes" in said
+
+
+def test_the_colmap_parser_names_a_lens_that_it_cannot_use(data, tmp_path):
+    file = data / "colmap/sparse/0/cameras.txt"
+    _, _, *numbers = file.read_text().split()
+    file.write_text(" ".join(["1", "FOV", *numbers, "0.5"]) + "\n")
+    said = train_colmap(data, tmp_path).sentence
+    assert f"The lens of {file.parent} cannot be used (FOV camera model" in said and "image_undistorter" in said
+
+
+def test_a_colmap_model_of_one_place_is_refused(data, tmp_path):
+    file = data / "colmap/sparse/0/images.txt"
+    file.write_text("".join(file.read_text().splitlines(keepends=True)[:2]))
+    assert "All 1 camera(s) of" in train_colmap(data, tmp_path).sentence
+
+
+def test_a_run_of_the_colmap_parser_can_be_rendered_without_its_images(data):
+    shutil.rmtree(data / "images")
+    settings = {"colmap_path": "colmap/sparse/0", "downscale_factor": 2}
+    manager = datamanager(data, test_mode="inference", dataparser=ColmapDataParserConfig(**settings))
+    assert int(manager.train_dataset.cameras.width[0]) == WIDTH // 2

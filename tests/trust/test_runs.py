@@ -13,6 +13,9 @@ import torch
 import yaml
 from forked import run, start, start_train, train
 from tiny_scene import TEST, name_of, write_scene
+from training_runs import ready, trainer_config
+
+from mmpi_ns.training.trainer import MMPITrainer
 
 LONG = {"max_num_iterations": 100_000, "steps_per_save": 100_000}
 
@@ -67,6 +70,32 @@ def test_a_run_that_is_stopped_before_it_trains_says_so(whole_scene, tmp_path):
     ended = running.end()
     assert ended.status == 130 and "Traceback" not in ended.out + ended.error
     assert ended.error.strip().splitlines()[-1].startswith("Stopped")
+
+
+def test_a_run_that_is_stopped_after_its_last_step_says_how_its_details_are_made(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(MMPITrainer, "_write_details", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit) as ended:
+        ready(trainer_config(scene, None, tmp_path, 2)).train()
+    said = capsys.readouterr().err
+    assert ended.value.code == 130 and "Stopped after the last step, which is in" in said and "step-000000001" in said
+
+
+def test_details_that_a_stopped_run_lacks_are_made_when_it_goes_on(whole_scene, finished, tmp_path):
+    shutil.rmtree(finished / "details")
+    again = {"load_dir": finished / "nerfstudio_models", "max_num_iterations": 6}
+    said = train(whole_scene, tmp_path, **again).shown
+    assert "already holds 6 of 6 steps: details of its training images are made" in said and "ns-eval" in said
+    assert "no details" not in evaluate(finished, tmp_path).shown
+    assert "nothing to do" in train(whole_scene, tmp_path, **again).shown
+
+
+def test_one_ctrl_c_closes_the_viewer_of_a_finished_run(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(MMPITrainer, "_train_complete_viewer", lambda _: signal.raise_signal(signal.SIGINT))
+    config = trainer_config(scene, None, tmp_path, 2)
+    config.viewer.quit_on_train_completion = False
+    with pytest.raises(SystemExit) as ended:
+        ready(config).train()
+    assert ended.value.code is None
 
 
 def test_a_stopped_run_goes_on_in_its_folder(whole_scene, tmp_path):
@@ -206,6 +235,7 @@ def test_no_checkpoint_is_said(whole_scene, finished, tmp_path):
     (finished / "nerfstudio_models" / "step-000000005.ckpt").unlink()
     assert "There is no checkpoint in" in evaluate(finished, tmp_path).sentence
     assert "There is no checkpoint in" in train(whole_scene, tmp_path / "n", load_dir=finished).sentence
+    assert not (tmp_path / "n").exists()  # nothing was begun: matching may take minutes
 
 
 def test_a_step_that_is_not_there_is_said(whole_scene, trained, tmp_path):
@@ -279,6 +309,15 @@ def test_mmpi_export_names_the_option_that_cannot_be_used(trained, tmp_path, opt
     place = ("--load-config", trained / "config.yml", "--output", tmp_path / "out")
     assert run("mmpi-export", "bake", *place, option, value).sentence.startswith(f"{option} must be")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("format", "name"), [("bake", "out"), ("splats", "out/scene.ply")])
+def test_mmpi_export_names_a_folder_that_cannot_be_written_before_it_bakes(trained, tmp_path, format, name):
+    (tmp_path / "notes.txt").write_text("a file")
+    place = ("--load-config", trained / "config.yml", "--output", tmp_path / "notes.txt" / name)
+    ended = run("mmpi-export", format, *place)
+    assert "notes.txt/out cannot be written" in ended.sentence and "choose another --output" in ended.sentence
+    assert "Loading" not in ended.out
 
 
 @pytest.mark.parametrize("text", ["", "hello", "a: [1,"])

@@ -159,6 +159,8 @@ def test_an_input_error_is_one_sentence_and_others_keep_their_traceback(monkeypa
     host.enter_command()
     sys.excepthook(InputError, InputError("The scene is empty."), None)
     assert capsys.readouterr().err == "ns-train: The scene is empty.\n" and not shown
+    sys.excepthook(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert not shown and capsys.readouterr().err.endswith(": Interrupted.\n")
     sys.excepthook(KeyError, KeyError("x"), None)
     assert len(shown) == 1
 
