@@ -12,16 +12,20 @@ from typing import Any
 
 import torch
 import yaml
+from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.export.codes import smoothed_codes
 from mmpi_ns.export.details import stored_view
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
+from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.scene.baked import most_of_copies, neighbours
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order
@@ -32,6 +36,8 @@ VIEW_BYTES = 1000
 """Of a training image beside its details: its row in the header, and its share of the page's program."""
 HARDLY = 0.01
 """Largest weight of a brick that is left out to make room for details."""
+SLACK = 0.3
+"""What a code may be off by, times the largest weight with which a training view sees its texel: about a grey level."""
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
 
@@ -101,7 +107,7 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         peaks = whole.peaks(alike, partial(rays_of, step))
         most = peaks.amax((1, 2))
         limit = _limit(most, least, int(room))
-        kept = replace(whole, seen=peaks.sum((1, 2))).keep(most >= limit)
+        kept = smoothed(replace(whole, seen=peaks.sum((1, 2))).keep(most >= limit), peaks[most >= limit])
         print(
             f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({limit:.3g} or more)."
         )
@@ -110,6 +116,21 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
     name = Path(pipeline.datamanager.get_datapath()).resolve().name
     return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows, views, nearest)
+
+
+def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
+    """The window with codes that take fewer bytes where training views see little of them.
+
+    Args:
+        window: as baked.
+        peaks: largest weights of its texels in training views.
+    """
+    mpis = window.mpis
+    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    slack = (SLACK / most_of_copies(peaks, beside)).clamp(max=255).to(torch.uint8)
+    channels = mpis.texels.unbind(-1)
+    texels = torch.stack(list(in_order(lambda codes: smoothed_codes(codes, slack, beside), channels)), -1)
+    return replace(window, mpis=replace(mpis, texels=texels, packed={}))
 
 
 def _limit(peaks: Tensor, least: float, bricks: int) -> float:
