@@ -207,6 +207,16 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys):
     assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
 
 
+def test_codes_are_off_where_training_views_see_little_of_them(trainer, monkeypatch):
+    filled(trainer)
+    smooth, seen = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis, []
+    monkeypatch.setattr(bake_module, "smoothed", lambda window, peaks: seen.append(peaks) or window)
+    exact = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis
+    off = (smooth.texels.int() - exact.texels.int()).abs().amax(-1)
+    assert (off * seen[0] <= bake_module.SLACK).all()
+    assert off.max() > 20 and torch.equal(smooth.density, exact.density)
+
+
 def test_bricks_that_are_seen_least_make_room_for_details():
     """As many as take their bytes, but none that shows, and none if all are asked for."""
     peaks = torch.tensor([0.001, 0.004, 0.02, 0.005, 0.006, 0.003])
