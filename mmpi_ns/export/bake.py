@@ -25,7 +25,7 @@ from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.metrics import ImageMetrics
-from mmpi_ns.scene.baked import most_of_copies, neighbours
+from mmpi_ns.scene.baked import Codes, most_of_copies, neighbours
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order
@@ -36,8 +36,9 @@ VIEW_BYTES = 1000
 """Of a training image beside its details: its row in the header, and its share of the page's program."""
 HARDLY = 0.01
 """Largest weight of a brick that is left out to make room for details."""
-SLACK = 0.3
-"""What a code may be off by, times the largest weight with which a training view sees its texel: about a grey level."""
+SLACK = 0.02
+"""What a texel's values (arguments of softplus, sigmoid and tanh) may be off by, times the largest weight with which a
+training view sees it: of a colour, 0.005 of a pixel."""
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
 
@@ -127,10 +128,15 @@ def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
     """
     mpis = window.mpis
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
-    slack = (SLACK / most_of_copies(peaks, beside)).clamp(max=255).to(torch.uint8)
-    channels = mpis.texels.unbind(-1)
-    texels = torch.stack(list(in_order(lambda codes: smoothed_codes(codes, slack, beside), channels)), -1)
-    return replace(window, mpis=replace(mpis, texels=texels, packed={}))
+    most = most_of_copies(peaks, beside)
+
+    def smooth(channel: tuple[Tensor, Codes]) -> Tensor:
+        table, codes = channel
+        return smoothed_codes(table, (SLACK / codes.step / most).clamp(max=255).to(torch.uint8), beside)
+
+    tables, codes = (mpis.density, *mpis.texels.unbind(-1)), (mpis.density_codes, *mpis.channel_codes)
+    density, *texels = in_order(smooth, zip(tables, codes, strict=True))
+    return replace(window, mpis=replace(mpis, density=density, texels=torch.stack(texels, -1), packed={}))
 
 
 def _limit(peaks: Tensor, least: float, bricks: int) -> float:

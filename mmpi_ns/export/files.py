@@ -36,8 +36,9 @@ FORMAT, VERSION = "mmpi-baked", 4
 HEADER = "scene.json"
 BLOCK = 1 << 20
 """Bytes that one thread compresses at a time."""
-EARLY = 0.2
-"""Share of the bricks whose coarse texels come first: those that training views see most of. A tenth of the bytes."""
+EARLY = 0.1
+"""Share of the differences that are not 0, and about of the bytes, in the first part of a file: coarse texels of the
+bricks that training views see most of."""
 PARTS_OF_VIEW = ("difference", "inverse")
 
 
@@ -191,12 +192,15 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
 def _arrays(window: BakedWindow) -> dict[str, NDArray[Any]]:
     """What is stored of a window, in the order of its file."""
     mpis = window.mpis
-    seen = torch.zeros(mpis.num_bricks) if window.seen is None else window.seen
-    early = torch.zeros(mpis.num_bricks, dtype=torch.bool)
-    early[seen.argsort(descending=True, stable=True)[: math.ceil(EARLY * len(seen))]] = True
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     channels = [mpis.density, *mpis.texels.unbind(-1)]
     coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
+    seen = torch.zeros(mpis.num_bricks) if window.seen is None else window.seen
+    order = seen.argsort(descending=True, stable=True)
+    stored = (coarse_differences(coarse) != 0).sum((0, 1))[order.numpy()].cumsum()
+    room = EARLY * (np.count_nonzero(fine) + stored[-1:].sum())
+    early = torch.zeros(mpis.num_bricks, dtype=torch.bool)
+    early[order[: 1 + np.searchsorted(stored, room)]] = True
     network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
     return {
         "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
