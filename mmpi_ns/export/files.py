@@ -7,6 +7,7 @@ import json
 import math
 import struct
 import zlib
+from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
@@ -37,8 +38,7 @@ HEADER = "scene.json"
 BLOCK = 1 << 20
 """Bytes that one thread compresses at a time."""
 EARLY = 0.1
-"""Share of the differences that are not 0, and about of the bytes, in the first part of a file: coarse texels of the
-bricks that training views see most of."""
+"""Share of a window's bytes that come first: coarse texels of the bricks that training views see most of."""
 PARTS_OF_VIEW = ("difference", "inverse")
 
 
@@ -148,7 +148,7 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
     mpis, shader = window.mpis, window.shader
     blob, places = b"", {}
     for name, array in _arrays(window).items():
-        data = _gzip(np.ascontiguousarray(array).tobytes())
+        data = _gzip(array)
         places[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
         blob += data
     bricks_bytes, view_rows = len(blob), []
@@ -195,12 +195,7 @@ def _arrays(window: BakedWindow) -> dict[str, NDArray[Any]]:
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     channels = [mpis.density, *mpis.texels.unbind(-1)]
     coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
-    seen = torch.zeros(mpis.num_bricks) if window.seen is None else window.seen
-    order = seen.argsort(descending=True, stable=True)
-    stored = (coarse_differences(coarse) != 0).sum((0, 1))[order.numpy()].cumsum()
-    room = EARLY * (np.count_nonzero(fine) + stored[-1:].sum())
-    early = torch.zeros(mpis.num_bricks, dtype=torch.bool)
-    early[order[: 1 + np.searchsorted(stored, room)]] = True
+    early = _early(window, coarse, fine)
     network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
     return {
         "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
@@ -212,9 +207,29 @@ def _arrays(window: BakedWindow) -> dict[str, NDArray[Any]]:
     }
 
 
-def _gzip(data: bytes) -> bytes:
+def _early(window: BakedWindow, coarse: NDArray[np.uint8], fine: NDArray[np.uint8]) -> Bool[Tensor, "B"]:
+    """The bricks whose coarse codes come first: those that training views see most of, as many as take ``EARLY`` of the
+    bytes."""
+    count = window.mpis.num_bricks
+    order = torch.arange(count) if window.seen is None else window.seen.argsort(descending=True, stable=True)
+
+    def first(thousandths: int) -> Bool[Tensor, "B"]:
+        early = torch.zeros(count, dtype=torch.bool)
+        early[order[: -(-count * thousandths // 1000)]] = True
+        return early
+
+    def size(codes: NDArray[np.uint8]) -> int:
+        return len(_gzip(coarse_differences(codes)))
+
+    room = EARLY * (size(coarse) + len(_gzip(fine)))
+    return first(bisect_right(range(1, 1000), room, key=lambda each: size(coarse[:, first(each).numpy()])))
+
+
+def _gzip(array: NDArray[Any]) -> bytes:
     """A gzip file, compressed in blocks on all threads; their number does not change a byte. Each block ends at a full
     byte and refers to none before it, so the blocks together are one stream."""
+
+    data = np.ascontiguousarray(array).tobytes()
 
     def compress(start: int) -> bytes:
         # Runs and frequent bytes alone: of differences that are mostly 0, other repetitions cost more than they save.
