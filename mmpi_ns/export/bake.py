@@ -36,9 +36,9 @@ VIEW_BYTES = 1000
 """Of a training image beside its details: its row in the header, and its share of the page's program."""
 HARDLY = 0.01
 """Largest weight of a brick that is left out to make room for details."""
-SLACK = 0.02
-"""What a texel's values (arguments of softplus, sigmoid and tanh) may be off by, times the largest weight with which a
-training view sees it: of a colour, 0.005 of a pixel."""
+SLACK = 0.01
+"""What a texel's colours and features may be off by (before sigmoid and tanh), times the largest weight with which a
+training view sees it: of a colour, at most 0.0025 of a pixel."""
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
 
@@ -120,7 +120,8 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
 
 
 def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
-    """The window with codes that take fewer bytes where training views see little of them.
+    """The window with colours and features that take fewer bytes where training views see little of them. Densities
+    stay: what they lose shows before the bytes do.
 
     Args:
         window: as baked.
@@ -134,9 +135,8 @@ def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
         table, codes = channel
         return smoothed_codes(table, (SLACK / codes.step / most).clamp(max=255).to(torch.uint8), beside)
 
-    tables, codes = (mpis.density, *mpis.texels.unbind(-1)), (mpis.density_codes, *mpis.channel_codes)
-    density, *texels = in_order(smooth, zip(tables, codes, strict=True))
-    return replace(window, mpis=replace(mpis, density=density, texels=torch.stack(texels, -1), packed={}))
+    texels = list(in_order(smooth, zip(mpis.texels.unbind(-1), mpis.channel_codes, strict=True)))
+    return replace(window, mpis=replace(mpis, texels=torch.stack(texels, -1), packed={}))
 
 
 def _limit(peaks: Tensor, least: float, bricks: int) -> float:
