@@ -30,12 +30,6 @@ from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order
 
-BRICK_BYTES = 60
-"""Of a brick that is seen little, as written: 80 on kitti-street, 96 on fox, and some less so that there is room."""
-VIEW_BYTES = 1000
-"""Of a training image beside its details: its row in the header, and its share of the page's program."""
-HARDLY = 0.01
-"""Largest weight of a brick that is left out to make room for details."""
 SLACK = 0.01
 """What a texel's colours and features may be off by (before sigmoid and tanh), times the largest weight with which a
 training view sees it: of a colour, at most 0.0025 of a pixel."""
@@ -74,8 +68,7 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
 
     Args:
         pipeline: of the run.
-        least: bricks in which no training view sees this weight are left out; 0 keeps all. Otherwise those that are
-            seen least make room for details.
+        least: bricks in which no training view sees this weight are left out; 0 keeps all.
 
     Raises:
         ValueError: the model cannot be baked (says why).
@@ -97,7 +90,6 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         views = tuple(in_order(lambda i: stored_view(read(i, torch.device("cpu"))), range(len(details.cameras))))
         written = sum(len(v.difference + v.inverse) for v in views)
         print(f"Details of {len(views)} training images: {written / 1e6:.2f} MB.")
-    room = sum(len(v.difference + v.inverse) + VIEW_BYTES for v in views) / BRICK_BYTES / len(places)
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
@@ -106,12 +98,9 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         step = math.ceil((float((cameras.width * cameras.height)[cameras_here].sum()) / MOST_LOOKED_AT) ** 0.5)
         alike = sorted(cameras_here, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
         peaks = whole.peaks(alike, partial(rays_of, step))
-        most = peaks.amax((1, 2))
-        limit = _limit(most, least, int(room))
-        kept = smoothed(replace(whole, seen=peaks.sum((1, 2))).keep(most >= limit), peaks[most >= limit])
-        print(
-            f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({limit:.3g} or more)."
-        )
+        seen = peaks.amax((1, 2)) >= least
+        kept = smoothed(replace(whole, seen=peaks.sum((1, 2))).keep(seen), peaks[seen])
+        print(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen.")
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
     path = poses_of(pipeline)
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
@@ -137,14 +126,6 @@ def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
 
     texels = list(in_order(smooth, zip(mpis.texels.unbind(-1), mpis.channel_codes, strict=True)))
     return replace(window, mpis=replace(mpis, texels=torch.stack(texels, -1), packed={}))
-
-
-def _limit(peaks: Tensor, least: float, bricks: int) -> float:
-    """The weight below which bricks are left out: ``least``, or more if so many others make room, up to ``HARDLY``."""
-    seen = peaks[peaks >= least].sort().values
-    if least == 0 or not bricks or not len(seen):
-        return least
-    return max(least, min(HARDLY, float(seen[min(bricks, len(seen) - 1)])))
 
 
 def poses_of(pipeline: Any) -> list[Pose]:

@@ -218,13 +218,6 @@ def test_codes_are_off_where_training_views_see_little_of_them(trainer, monkeypa
     assert torch.equal(smooth.density, exact.density)
 
 
-def test_bricks_that_are_seen_least_make_room_for_details():
-    """As many as take their bytes, but none that shows, and none if all are asked for."""
-    peaks = torch.tensor([0.001, 0.004, 0.02, 0.005, 0.006, 0.003])
-    limits = [bake_module._limit(peaks, *each) for each in ((0.003, 0), (0.003, 2), (0.003, 99), (0.0, 2), (0.015, 9))]
-    assert limits == pytest.approx([0.003, 0.005, 0.01, 0.0, 0.015])
-
-
 def test_the_weights_of_an_image_are_looked_at_in_parts(trainer, monkeypatch):
     """A photo of 12 megapixels at once would take gigabytes."""
     window = filled(trainer).baked(trainer.pipeline.model.field)
