@@ -147,7 +147,7 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
     header."""
     mpis, shader = window.mpis, window.shader
     blob, places = b"", {}
-    for name, array in _arrays(window).items():
+    for name, array in _arrays(window, sum(len(view.difference + view.inverse) for view in views)).items():
         data = _gzip(array)
         places[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
         blob += data
@@ -189,13 +189,13 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
     }
 
 
-def _arrays(window: BakedWindow) -> dict[str, NDArray[Any]]:
-    """What is stored of a window, in the order of its file."""
+def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
+    """What is stored of a window, in the order of its file; so many bytes of details come behind it."""
     mpis = window.mpis
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     channels = [mpis.density, *mpis.texels.unbind(-1)]
     coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
-    early = _early(window, coarse, fine)
+    early = _early(window, coarse, len(_gzip(fine)) + behind)
     network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
     return {
         "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
@@ -207,9 +207,9 @@ def _arrays(window: BakedWindow) -> dict[str, NDArray[Any]]:
     }
 
 
-def _early(window: BakedWindow, coarse: NDArray[np.uint8], fine: NDArray[np.uint8]) -> Bool[Tensor, "B"]:
+def _early(window: BakedWindow, coarse: NDArray[np.uint8], behind: int) -> Bool[Tensor, "B"]:
     """The bricks whose coarse codes come first: those that training views see most of, as many as take ``EARLY`` of the
-    bytes."""
+    bytes, if so many come behind all coarse codes."""
     count = window.mpis.num_bricks
     order = torch.arange(count) if window.seen is None else window.seen.argsort(descending=True, stable=True)
 
@@ -221,7 +221,7 @@ def _early(window: BakedWindow, coarse: NDArray[np.uint8], fine: NDArray[np.uint
     def size(codes: NDArray[np.uint8]) -> int:
         return len(_gzip(coarse_differences(codes)))
 
-    room = EARLY * (size(coarse) + len(_gzip(fine)))
+    room = EARLY * (size(coarse) + behind)
     return first(bisect_right(range(1, 1000), room, key=lambda each: size(coarse[:, first(each).numpy()])))
 
 
