@@ -195,21 +195,26 @@ def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     channels = [mpis.density, *mpis.texels.unbind(-1)]
     coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
-    early = _early(window, coarse, len(_gzip(fine)) + behind)
     network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
+    others = {
+        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
+        "columns": mpis.columns[:, 0].numpy().view(np.uint32),
+    }
+    beside_bricks = sum(len(_gzip(array)) for array in others.values())  # the first part has columns too
+    room = EARLY * (len(_gzip(coarse_differences(coarse))) + len(_gzip(fine)) + beside_bricks + behind) - beside_bricks
+    early = _early(window, coarse, room)
     return {
         "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
         "early": coarse_differences(coarse[:, early.numpy()]),
-        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
-        "columns": mpis.columns[:, 0].numpy().view(np.uint32),
+        **others,
         "late": coarse_differences(coarse[:, ~early.numpy()]),
         "fine": fine,
     }
 
 
-def _early(window: BakedWindow, coarse: NDArray[np.uint8], behind: int) -> Bool[Tensor, "B"]:
-    """The bricks whose coarse codes come first: those that training views see most of, as many as take ``EARLY`` of the
-    bytes, if so many come behind all coarse codes."""
+def _early(window: BakedWindow, coarse: NDArray[np.uint8], room: float) -> Bool[Tensor, "B"]:
+    """The bricks whose coarse codes come first: those that training views see most of, as many as fit into so many
+    bytes."""
     count = window.mpis.num_bricks
     order = torch.arange(count) if window.seen is None else window.seen.argsort(descending=True, stable=True)
 
@@ -218,11 +223,10 @@ def _early(window: BakedWindow, coarse: NDArray[np.uint8], behind: int) -> Bool[
         early[order[: -(-count * thousandths // 1000)]] = True
         return early
 
-    def size(codes: NDArray[np.uint8]) -> int:
-        return len(_gzip(coarse_differences(codes)))
+    def size(thousandths: int) -> int:
+        return len(_gzip(coarse_differences(coarse[:, first(thousandths).numpy()])))
 
-    room = EARLY * (size(coarse) + behind)
-    return first(bisect_right(range(1, 1000), room, key=lambda each: size(coarse[:, first(each).numpy()])))
+    return first(bisect_right(range(1, 1000), room, key=size))
 
 
 def _gzip(array: NDArray[Any]) -> bytes:
