@@ -32,12 +32,12 @@ def smoothed_codes(
         slack: what each may be off by. The first one of a brick is never off.
         beside: the bricks right of each brick and below it, -1 for none.
     """
-    exact, slack = codes.numpy().astype(np.int16), slack.numpy()
+    exact, most_off = codes.numpy().astype(np.int16), slack.numpy()
     smooth = np.zeros((len(codes), SIDE + 2, SIDE + 2), np.int16)  # two rows and columns of 0 lie before the brick
     inside = smooth[:, 2:, 2:]
 
     def settle(at: tuple[Any, ...], expected: NDArray[np.int16]) -> None:
-        inside[at] = np.where(np.abs(exact[at] - expected) > slack[at], exact[at], expected.clip(0, 255))
+        inside[at] = np.where(np.abs(exact[at] - expected) > most_off[at], exact[at], expected.clip(0, 255))
 
     inside[:, 0, 0] = exact[:, 0, 0]
     for y, x in np.argwhere(COARSE)[1:]:
