@@ -12,26 +12,27 @@ from typing import Any
 
 import torch
 import yaml
+from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.export.codes import smoothed_codes
 from mmpi_ns.export.details import stored_view
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
+from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.scene.baked import Codes, most_of_copies, neighbours
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order
 
-BRICK_BYTES = 60
-"""Of a brick that is seen little, as written: 80 on kitti-street, 96 on fox, and some less so that there is room."""
-VIEW_BYTES = 1000
-"""Of a training image beside its details: its row in the header, and its share of the page's program."""
-HARDLY = 0.01
-"""Largest weight of a brick that is left out to make room for details."""
+SLACK = 0.01
+"""What a texel's colours and features may be off by (before sigmoid and tanh), times the largest weight with which a
+training view sees it: of a colour, at most 0.0025 of a pixel."""
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
 
@@ -67,8 +68,7 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
 
     Args:
         pipeline: of the run.
-        least: bricks in which no training view sees this weight are left out; 0 keeps all. Otherwise those that are
-            seen least make room for details.
+        least: bricks in which no training view sees this weight are left out; 0 keeps all.
 
     Raises:
         ValueError: the model cannot be baked (says why).
@@ -90,7 +90,6 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         views = tuple(in_order(lambda i: stored_view(read(i, torch.device("cpu"))), range(len(details.cameras))))
         written = sum(len(v.difference + v.inverse) for v in views)
         print(f"Details of {len(views)} training images: {written / 1e6:.2f} MB.")
-    room = sum(len(v.difference + v.inverse) + VIEW_BYTES for v in views) / BRICK_BYTES / len(places)
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
@@ -99,12 +98,9 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         step = math.ceil((float((cameras.width * cameras.height)[cameras_here].sum()) / MOST_LOOKED_AT) ** 0.5)
         alike = sorted(cameras_here, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
         peaks = whole.peaks(alike, partial(rays_of, step))
-        most = peaks.amax((1, 2))
-        limit = _limit(most, least, int(room))
-        kept = replace(whole, seen=peaks.sum((1, 2))).keep(most >= limit)
-        print(
-            f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({limit:.3g} or more)."
-        )
+        seen = peaks.amax((1, 2)) >= least
+        kept = smoothed(replace(whole, seen=peaks.sum((1, 2))).keep(seen), peaks[seen])
+        print(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen.")
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
     path = poses_of(pipeline)
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
@@ -112,12 +108,24 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
     return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows, views, nearest)
 
 
-def _limit(peaks: Tensor, least: float, bricks: int) -> float:
-    """The weight below which bricks are left out: ``least``, or more if so many others make room, up to ``HARDLY``."""
-    seen = peaks[peaks >= least].sort().values
-    if least == 0 or not bricks or not len(seen):
-        return least
-    return max(least, min(HARDLY, float(seen[min(bricks, len(seen) - 1)])))
+def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
+    """The window with colours and features that take fewer bytes where training views see little of them. Densities
+    stay: what they lose shows before the bytes do.
+
+    Args:
+        window: as baked.
+        peaks: largest weights of its texels in training views.
+    """
+    mpis = window.mpis
+    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    most = most_of_copies(peaks, beside)
+
+    def smooth(channel: tuple[Tensor, Codes]) -> Tensor:
+        table, codes = channel
+        return smoothed_codes(table, (SLACK / codes.step / most).clamp(max=255).to(torch.uint8), beside)
+
+    texels = list(in_order(smooth, zip(mpis.texels.unbind(-1), mpis.channel_codes, strict=True)))
+    return replace(window, mpis=replace(mpis, texels=torch.stack(texels, -1), packed={}))
 
 
 def poses_of(pipeline: Any) -> list[Pose]:

@@ -1,8 +1,4 @@
-"""Baked scenes on disk: a header ``scene.json`` and one file of arrays for each window (format: docs/export.md).
-
-Of the codes of a channel, every second row and column of a brick is stored apart from the others: a page that has these
-shows a brick at half of its resolution, and nothing is stored twice.
-"""
+"""Baked scenes on disk: a header ``scene.json`` and one file of arrays for each window (format: docs/export.md)."""
 
 from __future__ import annotations
 
@@ -11,6 +7,7 @@ import json
 import math
 import struct
 import zlib
+from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,27 +15,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.export.codes import coarse_differences, joined_codes, split_codes
 from mmpi_ns.export.details import STEP, StoredView, cameras_of, restored_view
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.details import Details, DetailView
 from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks, render_windows
-from mmpi_ns.scene.baked import (
-    CELLS,
-    SIDE,
-    BakedMpis,
-    Codes,
-    Shader,
-    bits_of,
-    neighbours,
-    numbered_columns,
-    take_borders,
-)
+from mmpi_ns.scene.baked import BakedMpis, Codes, Shader, bits_of, neighbours, numbered_columns
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.errors import InputError
@@ -49,11 +37,8 @@ FORMAT, VERSION = "mmpi-baked", 4
 HEADER = "scene.json"
 BLOCK = 1 << 20
 """Bytes that one thread compresses at a time."""
-EARLY = 0.2
-"""Share of the bricks whose coarse texels come first: those that training views see most of. A tenth of the bytes."""
-COARSE = np.zeros((SIDE, SIDE), bool)
-"""Texels that are stored first."""
-COARSE[::2, ::2] = True
+EARLY = 0.1
+"""Share of a window's bytes that come first: coarse texels of the bricks that training views see most of."""
 PARTS_OF_VIEW = ("difference", "inverse")
 
 
@@ -161,24 +146,9 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
     """Writes a window's arrays one after the other, each compressed, and then details; returns the window's part of the
     header."""
     mpis, shader = window.mpis, window.shader
-    seen = torch.zeros(mpis.num_bricks) if window.seen is None else window.seen
-    early = torch.zeros(mpis.num_bricks, dtype=torch.bool)
-    early[seen.argsort(descending=True, stable=True)[: math.ceil(EARLY * len(seen))]] = True
-    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
-    channels = [mpis.density, *mpis.texels.unbind(-1)]
-    coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
-    network = [x.detach().half().reshape(-1) for layer in shader.layers for x in layer]
-    arrays = {
-        "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
-        "early": coarse_differences(coarse[:, early.numpy()]),
-        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
-        "columns": mpis.columns[:, 0].numpy().view(np.uint32),
-        "late": coarse_differences(coarse[:, ~early.numpy()]),
-        "fine": fine,
-    }
     blob, places = b"", {}
-    for name, array in arrays.items():
-        data = _gzip(np.ascontiguousarray(array).tobytes())
+    for name, array in _arrays(window, sum(len(view.difference + view.inverse) for view in views)).items():
+        data = _gzip(array)
         places[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
         blob += data
     bricks_bytes, view_rows = len(blob), []
@@ -219,15 +189,56 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
     }
 
 
-def _gzip(data: bytes) -> bytes:
+def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
+    """What is stored of a window, in the order of its file; so many bytes of details come behind it."""
+    mpis = window.mpis
+    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    channels = [mpis.density, *mpis.texels.unbind(-1)]
+    coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
+    network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
+    others = {
+        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
+        "columns": mpis.columns[:, 0].numpy().view(np.uint32),
+    }
+    beside_bricks = sum(len(_gzip(array)) for array in others.values())  # the first part has columns too
+    room = EARLY * (len(_gzip(coarse_differences(coarse))) + len(_gzip(fine)) + beside_bricks + behind) - beside_bricks
+    early = _early(window, coarse, room)
+    return {
+        "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
+        "early": coarse_differences(coarse[:, early.numpy()]),
+        **others,
+        "late": coarse_differences(coarse[:, ~early.numpy()]),
+        "fine": fine,
+    }
+
+
+def _early(window: BakedWindow, coarse: NDArray[np.uint8], room: float) -> Bool[Tensor, "B"]:
+    """The bricks whose coarse codes come first: those that training views see most of, as many as fit into so many
+    bytes."""
+    count = window.mpis.num_bricks
+    order = torch.arange(count) if window.seen is None else window.seen.argsort(descending=True, stable=True)
+
+    def first(thousandths: int) -> Bool[Tensor, "B"]:
+        early = torch.zeros(count, dtype=torch.bool)
+        early[order[: -(-count * thousandths // 1000)]] = True
+        return early
+
+    def size(thousandths: int) -> int:
+        return len(_gzip(coarse_differences(coarse[:, first(thousandths).numpy()])))
+
+    return first(bisect_right(range(1, 1000), room, key=size))
+
+
+def _gzip(array: NDArray[Any]) -> bytes:
     """A gzip file, compressed in blocks on all threads; their number does not change a byte. Each block ends at a full
-    byte and has what precedes it as its dictionary, so the blocks together are one stream (as of pigz)."""
+    byte and refers to none before it, so the blocks together are one stream."""
+
+    data = np.ascontiguousarray(array).tobytes()
 
     def compress(start: int) -> bytes:
-        before, ends = data[max(0, start - (1 << 15)) : start], start + BLOCK >= len(data)
-        # For numbers that are mostly small. Level 9 takes seven times as long and saves a thirtieth.
-        how = (6, zlib.DEFLATED, -15, 9, zlib.Z_FILTERED)
-        packer = zlib.compressobj(*how, zdict=before) if before else zlib.compressobj(*how)
+        # Runs and frequent bytes alone: of differences that are mostly 0, other repetitions cost more than they save.
+        packer = zlib.compressobj(6, zlib.DEFLATED, -15, 9, zlib.Z_RLE)
+        ends = start + BLOCK >= len(data)
         return packer.compress(data[start : start + BLOCK]) + packer.flush(zlib.Z_FINISH if ends else zlib.Z_SYNC_FLUSH)
 
     blocks = in_order(compress, range(0, max(len(data), 1), BLOCK))
@@ -279,24 +290,32 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, Baked
     def part(spec: dict[str, int]) -> bytes:
         return blob[spec["offset"] : spec["offset"] + spec["bytes"]]
 
-    def array(name: str) -> NDArray[Any]:
-        spec = row["arrays"][name]
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, spec in row["arrays"].items():
         try:
             data = gzip.decompress(part(spec))
-            return np.frombuffer(data, spec["type"]).reshape(spec["shape"]).copy()
+            arrays[name] = np.frombuffer(data, spec["type"]).reshape(spec["shape"]).copy()
         except (OSError, EOFError, ValueError) as error:
             raise ValueError(
                 f"{path} is damaged ('{name}': {error}): copy it anew, or bake the scene again."
             ) from error
-
+    views = tuple(
+        StoredView(tuple(view["camera"]), tuple(view["size"]), view["most"], *(part(view[x]) for x in PARTS_OF_VIEW))
+        for view in row["views"]
+    )
     mpi_rows = [{name: m[name] for name in MPIPlan.__dataclass_fields__} for m in row["mpis"]]
     nears = {"ray_near": row["ray_near"], "content_near": row["content_near"]}
     plan = ScenePlan.from_object({"mpis": mpi_rows, "cube": None, "origin_of_plan": "baked", **nears})
     radius = math.inf if row["radius"] is None else row["radius"]
-    masks, early_masks = (torch.from_numpy(array(name).view(np.int32)) for name in ("columns", "early_columns"))
+    return (Window(tuple(row["center"]), radius, row["margin"], plan), _window_of(row, plan, arrays)), views
+
+
+def _window_of(row: dict[str, Any], plan: ScenePlan, arrays: dict[str, NDArray[Any]]) -> BakedWindow:
+    """A window from its part of the header and what ``_arrays`` gave."""
+    masks, early_masks = (torch.from_numpy(arrays[name].view(np.int32)) for name in ("columns", "early_columns"))
     columns, early = numbered_columns(masks), bits_of(early_masks)[bits_of(masks) > 0] > 0
     beside = neighbours(columns, plan.mpis, len(early))
-    channels = zip(*map(array, ("early", "late", "fine")), strict=True)
+    channels = zip(*(arrays[name] for name in ("early", "late", "fine")), strict=True)
     density, *texels = (joined_codes(parts, early, beside) for parts in channels)
     baked = BakedMpis(
         plan.mpis,
@@ -307,7 +326,7 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, Baked
         Codes(**row["density"]),
         tuple(Codes(**c) for c in row["channels"]),
     )
-    layers, numbers, start = [], torch.from_numpy(array("network")).float(), 0
+    layers, numbers, start = [], torch.from_numpy(arrays["network"]).float(), 0
     for outputs, inputs in row["shader"]["layers"]:
         weights, biases = numbers[start : start + outputs * inputs], numbers[start + outputs * inputs :][:outputs]
         layers.append((weights.view(outputs, inputs), biases))
@@ -315,60 +334,4 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, Baked
     shader = Shader(tuple(layers), row["shader"]["direction_octaves"], row["shader"]["bound"])
     exposure = tuple(row.get("exposure", (1.0, 1.0, 1.0)))  # before images were shown at one exposure
     near, far = row["ray_near"], row["farthest"]
-    window = BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure, early.float())
-    views = tuple(
-        StoredView(tuple(view["camera"]), tuple(view["size"]), view["most"], *(part(view[x]) for x in PARTS_OF_VIEW))
-        for view in row["views"]
-    )
-    return (Window(tuple(row["center"]), radius, row["margin"], plan), window), views
-
-
-def split_codes(
-    codes: UInt8[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Coarse codes [B, 4, 4], and the stored form of the others [48, B]: differences, modulo 256, from the means of
-    those beside them; 0 for border texels that a neighbour also contains.
-
-    Args:
-        codes: of all bricks.
-        beside: the bricks right of each brick and below it, -1 for none.
-    """
-    fine, (right, below) = codes.numpy().copy(), (beside >= 0).numpy()
-    coarse = fine[:, ::2, ::2].copy()
-    fine[:, 1::2] -= _means(fine[:, ::2], 1)
-    fine[:, ::2, 1::2] -= _means(coarse, 2)
-    fine[right, :, CELLS] = fine[below, CELLS] = 0
-    return coarse, fine[:, ~COARSE].T
-
-
-def coarse_differences(coarse: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Coarse codes [C, B, 4, 4] as they are stored [C, 16, B]: differences along rows and columns, and along bricks for
-    the first texels."""
-    stored = np.diff(np.diff(coarse, axis=3, prepend=np.uint8(0)), axis=2, prepend=np.uint8(0))
-    stored[:, :, 0, 0] = np.diff(stored[:, :, 0, 0], prepend=np.uint8(0))
-    return stored.reshape(*coarse.shape[:2], -1).swapaxes(1, 2)
-
-
-def joined_codes(
-    parts: tuple[NDArray[np.uint8], ...], is_early: Bool[Tensor, "B"], beside: Int[Tensor, "2 B"]
-) -> UInt8[Tensor, "B 8 8"]:
-    """The codes of a channel from its stored parts (``split_codes``, ``coarse_differences``): coarse codes of the early
-    bricks, those of the others, and fine ones."""
-    early, late, fine = parts
-    codes = np.empty((fine.shape[1], SIDE, SIDE), np.uint8)
-    for stored, bricks in ((early, is_early.numpy()), (late, ~is_early.numpy())):
-        coarse = stored.T.reshape(-1, SIDE // 2, SIDE // 2).copy()
-        coarse[:, 0, 0] = np.cumsum(coarse[:, 0, 0], dtype=np.uint8)
-        codes[bricks, ::2, ::2] = coarse.cumsum(1, dtype=np.uint8).cumsum(2, dtype=np.uint8)
-    codes[:, ~COARSE] = fine.T
-    codes[:, ::2, 1::2] += _means(codes[:, ::2, ::2], 2)
-    codes[:, 1::2] += _means(codes[:, ::2], 1)
-    joined = torch.from_numpy(codes)
-    take_borders(joined, beside)
-    return joined
-
-
-def _means(codes: NDArray[np.uint8], axis: int) -> NDArray[np.uint8]:
-    """Means, rounded down, of codes and those after them along an axis; the last ones have none after them."""
-    after = np.concatenate([np.delete(codes, 0, axis), np.take(codes, [-1], axis)], axis)
-    return ((codes.astype(np.uint16) + after) >> 1).astype(np.uint8)
+    return BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure, early.float())

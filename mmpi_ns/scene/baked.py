@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from mmpi_ns.scene.plan import MPIPlan
@@ -142,13 +142,20 @@ def neighbours(columns: Int[Tensor, "N 2"], mpis: tuple[MPIPlan, ...], count: in
     return bricks
 
 
-def take_borders(codes: UInt8[Tensor, "B 8 8 ..."], beside: Int[Tensor, "2 B"]) -> None:
+def take_borders(codes: Shaped[Tensor, "B 8 8 ..."], beside: Int[Tensor, "2 B"]) -> None:
     """Copies the shared texels of the bricks to the right and below into the last column and row of each brick."""
     (right, has_right), (below, has_below) = ((x.clamp(min=0), x >= 0) for x in beside)
     codes[has_right, :CELLS, CELLS] = codes[right[has_right], :CELLS, 0]
     codes[has_below, CELLS] = codes[below[has_below], 0]
     alone = has_right & ~has_below
     codes[alone, CELLS, CELLS] = codes[right[alone], CELLS, 0]
+
+
+def most_of_copies(values: Float[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]) -> Float[Tensor, "B 8 8"]:
+    """The largest value among the bricks that share each texel; values are not negative."""
+    texels = torch.arange(values.numel()).view(values.shape)
+    take_borders(texels, beside)
+    return torch.zeros(values.numel()).scatter_reduce_(0, texels.flatten(), values.flatten(), "amax")[texels]
 
 
 def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Tensor, "B 3"]]:

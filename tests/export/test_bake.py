@@ -207,11 +207,15 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys):
     assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
 
 
-def test_bricks_that_are_seen_least_make_room_for_details():
-    """As many as take their bytes, but none that shows, and none if all are asked for."""
-    peaks = torch.tensor([0.001, 0.004, 0.02, 0.005, 0.006, 0.003])
-    limits = [bake_module._limit(peaks, *each) for each in ((0.003, 0), (0.003, 2), (0.003, 99), (0.0, 2), (0.015, 9))]
-    assert limits == pytest.approx([0.003, 0.005, 0.01, 0.0, 0.015])
+def test_codes_are_off_where_training_views_see_little_of_them(trainer, monkeypatch):
+    filled(trainer)
+    smooth, seen = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis, []
+    monkeypatch.setattr(bake_module, "smoothed", lambda window, peaks: seen.append(peaks) or window)
+    exact = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis
+    for i, codes in enumerate(exact.channel_codes):
+        off = codes.step * (smooth.texels[..., i].int() - exact.texels[..., i].int()).abs()
+        assert (off * seen[0] <= bake_module.SLACK + 1e-6).all() and off.max() > 1
+    assert torch.equal(smooth.density, exact.density)
 
 
 def test_the_weights_of_an_image_are_looked_at_in_parts(trainer, monkeypatch):
