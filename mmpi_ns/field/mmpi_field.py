@@ -243,11 +243,12 @@ class MMPIField(TexelTables):
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""
-        total, scales = self.density.new_zeros(()), []
-        for k, grid in enumerate(self.grids):
-            side = max(grid.width, grid.height)
-            sides = (side, side, grid.depth) if k < len(self.plan.mpis) else (grid.width, grid.height, grid.depth)
-            scales.append((sides[0] / 128, sides[1] / 128, sides[2] / 128))
+        total = self.density.new_zeros(())
+        if (scales := self.cached("resolution")) is None:
+            longest = ((max(grid.width, grid.height), grid) for grid in self.grids)
+            sides = [(g.width, g.height, g.depth) if g.is_cube else (side, side, g.depth) for side, g in longest]
+            resolution = torch.tensor(sides, dtype=torch.float32, device=total.device) / 128
+            scales = self.cached("resolution", lambda: resolution)
         for table, values, weight in (
             (self.density, lookup.density, density_weight),
             (self.features, lookup.features, feature_weight),

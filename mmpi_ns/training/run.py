@@ -165,7 +165,7 @@ class TrainingRun:
             progress.window = window
             for kind, params in groups.items():
                 if kind in optimizers:
-                    optimizers[kind].reset_moments(params[0])
+                    optimizers[kind].state.pop(params[0], None)
         prepare_storage(field, schedule, step, self.release_weight, optimizers)
         if attributes is not None and attributes.pipeline is not None:
             manager = attributes.pipeline.datamanager

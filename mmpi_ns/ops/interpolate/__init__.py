@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds, run_in_parts
+from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
@@ -70,12 +70,6 @@ class Table(nn.Parameter):
             index, ones = index_rows(rows[:, None], len(self), pads=True), torch.ones_like(values[:, :1])
             rows, values = index.unique, sum_rows(index.positions, values, ones, len(index.unique))
         self.grad_rows, self._row_grad = rows, values
-
-    def dense_grad(self) -> Float[Tensor, "T C"] | None:
-        """The gradient of all rows; to look at, not to train with."""
-        if self.grad_rows is None or self._row_grad is None:
-            return None
-        return torch.zeros_like(self.data).index_add_(0, self.grad_rows, self._row_grad)
 
 
 @operation()
@@ -226,13 +220,13 @@ def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] |
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
-    run_in_parts("mmpi_count_heads", bounds, heads, valid, num_heads, in_parts)
+    call_in_parts("mmpi_count_heads", bounds, heads, valid, num_heads, in_parts)
     totals = in_parts.sum(0)
     starts = totals.cumsum(0) - totals + in_parts.cumsum(0) - in_parts
     count = int(totals.sum())
     slots, of_heads, of_planes = torch.empty(3, count, dtype=torch.int64)
     columns = (slots, of_heads, of_planes, torch.empty(count, 3))
-    run_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
+    call_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
     return HeadSamples(*columns, totals.tolist())
 
 
@@ -256,10 +250,10 @@ def index_rows_on_cpu(rows: Tensor, table_rows: int, pads: bool = False) -> RowI
     call_in_parts("mmpi_mark_rows", count, listed, words, least=AT_LEAST)
     bounds = even_bounds(len(words), AT_LEAST)
     counts = torch.empty(len(bounds) - 1, dtype=torch.int64)
-    run_in_parts("mmpi_count_rows", bounds, words, counts)
+    call_in_parts("mmpi_count_rows", bounds, words, counts)
     ends = counts.cumsum(0)
     unique = torch.empty(int(ends[-1]), dtype=torch.int64)
-    run_in_parts("mmpi_list_rows", bounds, words, ends - counts, before, unique)
+    call_in_parts("mmpi_list_rows", bounds, words, ends - counts, before, unique)
     call_in_parts("mmpi_place_rows", count, listed, words, before, positions, least=AT_LEAST)
     return RowIndex(unique, positions)
 
@@ -270,7 +264,7 @@ def sum_rows_on_cpu(positions: Tensor, values: Tensor, weights: Tensor, count: i
         return sum_rows.reference(positions, values, weights, count)
     sums, entries = torch.empty(count, values.shape[1]), (x.contiguous() for x in (positions, weights, values))
     bounds = owned_bounds([positions], count, AT_LEAST)
-    run_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
+    call_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
     return sums
 
 

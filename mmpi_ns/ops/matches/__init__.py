@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mmpi_ns.ops.build import run_in_parts
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import dense
 
@@ -204,7 +204,7 @@ MOST = 16
 
 
 def _written(maps: Maps, name: str, *values: Any) -> Maps:
-    run_in_parts(f"mmpi_{name}", [0, len(maps[0])], *values, *maps)
+    call_in_parts(f"mmpi_{name}", [0, len(maps[0])], *values, *maps)
     return maps
 
 
