@@ -123,7 +123,7 @@ def measure(
     for rows in strips(start.shape):
         at, correlations = (torch.from_numpy(x[rows]), torch.from_numpy(y[rows])), torch.from_numpy(alike[rows])
         counted = torch.from_numpy(usable[rows])
-        solved = solve_matches(*at, correlations, counted, *parallax.tensors, rows.start, NOISE, MAX_EPIPOLAR)
+        solved = solve_matches(*at, correlations, counted, *parallax.tensors, rows.start, NOISE**2, MAX_EPIPOLAR**2)
         inverse[rows], weight[rows] = (values.numpy() for values in solved)
     return inverse, weight
 
@@ -159,10 +159,10 @@ def fuse(inverse: Sequence[Map], weight: Sequence[Map]) -> Depth:
     """
     depth = Depth(*np.empty((2, *inverse[0].shape), np.float32))
     for rows in strips(inverse[0].shape):
-        q, certainty = (torch.from_numpy(np.stack([x[rows].ravel() for x in each])) for each in (inverse, weight))
+        q, certainty = (torch.from_numpy(np.stack([x[rows] for x in each])) for each in (inverse, weight))
         averaged = average_matches(q, certainty, MAX_RELATIVE)
         for values, average in zip((depth.inverse, depth.error), averaged, strict=True):
-            values[rows] = average.numpy().reshape(-1, values.shape[1])
+            values[rows] = average.numpy()
     return depth
 
 

@@ -15,14 +15,14 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Generic, Literal, ParamSpec, TypeVar
+from typing import Any, Generic, Literal, ParamSpec, TypeVar, get_type_hints
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
-from mmpi_ns.ops.layout import SMALL, Shapes, check_shapes
+from mmpi_ns.ops.layout import SMALL, Shapes, annotated, check_shapes, dense, dense_fields
 from mmpi_ns.utils.errors import InputError
 
 Route = Literal["auto", "torch", "native"]
@@ -107,6 +107,38 @@ def operation(*compiled: Form, check: Callable[..., None] | None = None) -> Call
         check: takes the same arguments and raises what their annotations cannot say.
     """
     return lambda reference: Operation(reference, compiled, check)
+
+
+def in_cpp(of: Operation[..., Any], least: int | None = None) -> None:
+    """Makes ``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ the form of an operation for a CPU.
+
+    Arguments are those of the definition, a named tuple's fields one by one; sizes what the letters in their
+    annotations stand for, in the order in which they occur; results the tensors of the named tuple that it returns.
+
+    Args:
+        of: the operation.
+        least: rows of the first result that are worth another thread; None: one thread computes all.
+    """
+    hints, forms = get_type_hints(of.reference), annotated(of.reference)
+
+    def form(*values: Any) -> Any:
+        arguments, sizes, passed = dict(zip(of.signature.parameters, values, strict=True)), {}, []
+        check_shapes(of.reference, arguments, sizes)
+        for name, value in arguments.items():
+            if isinstance(value, Tensor):
+                passed += dense(value, dtype=forms[name][1])
+            else:
+                passed += dense_fields(value) if isinstance(value, tuple) else [hints[name](value)]
+        columns = annotated(hints["return"]).values()
+        results = hints["return"](
+            *(torch.empty([sizes.get(n, n) for n in shape], dtype=kind) for shape, kind in columns)
+        )
+        rows = len(results[0])
+        parts = [0, rows] if least is None else rows
+        build.call_in_parts(f"mmpi_{of.name}", parts, *passed, *sizes.values(), *results, least=least or 1)
+        return results
+
+    of.on_cpu(form)
 
 
 @functools.cache

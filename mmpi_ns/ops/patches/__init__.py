@@ -8,15 +8,13 @@ a + q b (``ops/matches``), which are linear in the pixel, too. Planes are judged
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 
-from mmpi_ns.ops.build import call_in_parts
-from mmpi_ns.ops.dispatch import operation
-from mmpi_ns.ops.layout import dense
+from mmpi_ns.ops.dispatch import in_cpp, operation
 
 REACH = 2
 """Pixels of a patch on each side of its middle."""
@@ -77,6 +75,9 @@ def compare_planes(
     return _better(_References(gray, stride), patches, planes, others)
 
 
+in_cpp(compare_planes, least=1)
+
+
 @operation()
 def spread_planes(
     gray: UInt8[Tensor, "H W"],
@@ -118,6 +119,9 @@ def spread_planes(
     scale = q / torch.where(towards < 0, towards.clamp(max=-GRAZING), towards.clamp(min=GRAZING))
     turned = torch.stack([q, scale * normal[..., 0] / fx, scale * normal[..., 1] / fy], -1)
     return _better(references, patches, turned, others)
+
+
+in_cpp(spread_planes, least=1)
 
 
 def _centers(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,24 +214,3 @@ def others_of(
         levels.append([first, *gray.shape])
         first += gray.numel()
     return Others(torch.cat(corners), torch.tensor(levels).view(-1, LEVELS, 3), linear, b)
-
-
-def _run(name: str, gray: Tensor, patches: Patches, others: Others, stride: int, *values: Any) -> Patches:
-    better = Patches(torch.empty_like(patches.planes), torch.empty_like(patches.alike))
-    arrays = *dense(gray, dtype=torch.uint8), *dense(others.corners, dtype=torch.int32)
-    count = len(others.levels)
-    compared = *gray.shape, *arrays, *dense(others.levels, dtype=torch.int64), *dense(others.linear, others.b)
-    call_in_parts(f"mmpi_{name}", len(gray), *compared, count, stride, *dense(*patches), *values, *better, least=1)
-    return better
-
-
-@compare_planes.on_cpu
-def compare_planes_on_cpu(gray: Tensor, patches: Patches, planes: Tensor, others: Others, stride: int) -> Patches:
-    return _run("compare_planes", gray, patches, others, stride, *dense(planes))
-
-
-@spread_planes.on_cpu
-def spread_planes_on_cpu(
-    gray: Tensor, patches: Patches, changes: Tensor, pinhole: Tensor, others: Others, stride: int, offset: int
-) -> Patches:
-    return _run("spread_planes", gray, patches, others, stride, *dense(changes, pinhole), offset)
