@@ -22,7 +22,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
-from mmpi_ns.ops.layout import SMALL, Shapes, annotated, check_shapes, dense, dense_fields
+from mmpi_ns.ops.layout import SMALL, Shapes, annotated, check_shapes
 from mmpi_ns.utils.errors import InputError
 
 Route = Literal["auto", "torch", "native"]
@@ -113,7 +113,8 @@ def in_cpp(of: Operation[..., Any], least: int | None = None) -> None:
     """Makes ``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ the form of an operation for a CPU.
 
     Arguments are those of the definition, a named tuple's fields one by one; sizes what the letters in their
-    annotations stand for, in the order in which they occur; results the tensors of the named tuple that it returns.
+    annotations stand for, in the order in which they occur; results the tensor, or those of the named tuple, that it
+    returns. Tensors of another type than annotated (int64 and float32, unless it names one) take the definition.
 
     Args:
         of: the operation.
@@ -121,22 +122,27 @@ def in_cpp(of: Operation[..., Any], least: int | None = None) -> None:
     """
     hints, forms = get_type_hints(of.reference), annotated(of.reference)
 
+    @functools.wraps(of.reference)
     def form(*values: Any) -> Any:
-        arguments, sizes, passed = dict(zip(of.signature.parameters, values, strict=True)), {}, []
-        check_shapes(of.reference, arguments, sizes)
-        for name, value in arguments.items():
-            if isinstance(value, Tensor):
-                passed += dense(value, dtype=forms[name][1])
-            else:
-                passed += dense_fields(value) if isinstance(value, tuple) else [hints[name](value)]
-        columns = annotated(hints["return"]).values()
-        results = hints["return"](
-            *(torch.empty([sizes.get(n, n) for n in shape], dtype=kind) for shape, kind in columns)
-        )
-        rows = len(results[0])
-        parts = [0, rows] if least is None else rows
+        sizes, passed = {}, []
+        for name, value in zip(of.signature.parameters, values, strict=True):
+            is_group, tensors, owner = hasattr(value, "_asdict"), {name: value}, of.reference
+            if not is_group and not isinstance(value, Tensor):
+                passed.append(hints[name](value))
+                continue
+            if is_group:
+                tensors, owner = value._asdict(), type(value)
+            for part, tensor in tensors.items():
+                shape, kind = annotated(owner)[part]
+                if tensor.dtype != kind:
+                    return of.reference(*values)
+                sizes |= {letter: n for letter, n in zip(shape, tensor.shape, strict=True) if isinstance(letter, str)}
+                passed.append(tensor.contiguous())
+        columns = [forms["return"]] if "return" in forms else annotated(hints["return"]).values()
+        results = [torch.empty([sizes.get(n, n) for n in shape], dtype=kind) for shape, kind in columns]
+        parts = [0, len(results[0])] if least is None else len(results[0])
         build.call_in_parts(f"mmpi_{of.name}", parts, *passed, *sizes.values(), *results, least=least or 1)
-        return results
+        return results[0] if "return" in forms else hints["return"](*results)
 
     of.on_cpu(form)
 

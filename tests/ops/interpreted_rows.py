@@ -109,7 +109,7 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     table = normal(len(grids[0].places) * 64, channels) * 2
     texels = torch.cat([g.rows[g.rows >= 64] for g in grids] + [torch.arange(5)])  # and some of the empty brick
     rows = texels[torch.randperm(len(texels), generator=torch.Generator().manual_seed(1))[:-9]]
-    scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
+    scales, found = torch.tensor([(0.5 + k, 2.0, 1.0) for k in range(len(grids))]), []
     for function, dtype in ((total_variation, torch.float32), (total_variation.reference, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
         value = function(values, table.to(dtype), rows, layout, scales)

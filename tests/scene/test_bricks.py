@@ -147,7 +147,7 @@ def test_variation_beside_released_bricks_equals_float64(channels, order):
     mixed = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(3))]
     rows = rows.sort()[0] if order == "rising" else mixed
     table = torch.randn(len(grids[0].places) * BRICK, channels, generator=torch.Generator().manual_seed(0)) * 2
-    scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
+    scales, found = torch.tensor([(0.5 + k, 2.0, 1.0) for k in range(len(grids))]), []
     for function, dtype in ((total_variation, torch.float32), (total_variation.reference, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
         value = function(values, table.to(dtype), rows, layout, scales)

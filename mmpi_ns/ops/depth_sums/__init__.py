@@ -81,4 +81,8 @@ class _DepthSums(torch.autograd.Function):
         return gradient, None, None, None, None, None
 
 
-depth_sums.on_cpu(lambda *arguments: DepthSums(*_DepthSums.apply(*arguments)))  # type: ignore[misc]
+depth_sums.on_cpu(
+    lambda weights, inverse_t, valid, intervals, targets, scale: DepthSums(
+        *_DepthSums.apply(weights, inverse_t, valid, intervals, targets, scale)  # type: ignore[misc]
+    )
+)

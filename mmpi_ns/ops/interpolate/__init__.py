@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int32
 from torch import Tensor, nn
 
 from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds
-from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.dispatch import in_cpp, operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
@@ -159,7 +159,7 @@ def weigh_rows(
 
 @operation("gpu")
 def weighted_rows(
-    table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+    table: Float[Tensor, "T C"], rows: Int32[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
     """Values of ``weigh_rows``."""
     return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
@@ -268,19 +268,5 @@ def sum_rows_on_cpu(positions: Tensor, values: Tensor, weights: Tensor, count: i
     return sums
 
 
-@weighted_rows.on_cpu
-def weighted_rows_on_cpu(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    if rows.dtype != torch.int32 or not table.is_contiguous():
-        return weighted_rows.reference(table, rows, weights)
-    values, entries = torch.empty(len(rows), table.shape[1]), (rows.contiguous(), weights.contiguous(), rows.shape[1])
-    call_in_parts("mmpi_weigh_rows", len(rows), table, *table.shape, *entries, values, least=AT_LEAST)
-    return values
-
-
-@take_rows.on_cpu
-def take_rows_on_cpu(table: Tensor, rows: Tensor) -> Tensor:
-    if not table.is_contiguous():
-        return take_rows.reference(table, rows)
-    values = torch.empty(len(rows), table.shape[1])
-    call_in_parts("mmpi_take_rows", len(rows), rows.contiguous(), table.shape[1], table, values, least=AT_LEAST)
-    return values
+in_cpp(weighted_rows, AT_LEAST)
+in_cpp(take_rows, AT_LEAST)
