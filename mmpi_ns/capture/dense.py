@@ -270,7 +270,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
 
 def filled(depth: Depth, surfaces: Surfaces) -> Depth:
     """Measured depths, and those of planes where hardly any is measured."""
-    is_measured, (inverse, error) = depth.inverse > 0, surfaces.without_edges().enlarged(depth.inverse.shape)
+    is_measured, (inverse, error) = depth.inverse > 0, surfaces.enlarged(depth.inverse.shape)
     side = 2 * int(max(is_measured.shape) * AROUND / 2) + 1
     is_bare = ~is_measured & (_mean(is_measured.astype(np.float32), side) < MEASURED)
     return Depth(np.where(is_bare, inverse, depth.inverse), np.where(is_bare, error, depth.error))

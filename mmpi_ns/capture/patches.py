@@ -63,20 +63,16 @@ class Surfaces:
         """Inverse depths where a plane is certain, else 0. [h, w]"""
         return np.where(self.error > 0, self.planes[..., 0], 0).astype(np.float32)
 
-    def without_edges(self) -> Surfaces:
-        """The same without the pixels next to a step in depth: patches reach across it."""
-        inverse, kernel = self.inverse, np.ones((3, 3), np.uint8)
-        nearest = cv2.dilate(inverse, kernel)
-        farthest = cv2.erode(np.where(inverse > 0, inverse, np.inf).astype(np.float32), kernel)
-        steps = (inverse > 0) & (nearest / SAME > farthest)
-        near = cv2.dilate(steps.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8))
-        return Surfaces(self.planes, np.where(near > 0, 0, self.error))
-
     def enlarged(self, shape: tuple[int, ...]) -> tuple[Map, Map]:
-        """Inverse depths and errors of an image of another size; both 0 where no plane is certain. [H, W] each"""
+        """Inverse depths and errors of an image of another size; both 0 where no plane is certain, and next to a step
+        in depth, across which patches reach. [H, W] each"""
+        inverse, kernel = self.inverse, np.ones((3, 3), np.uint8)
+        farthest = cv2.erode(np.where(inverse > 0, inverse, np.inf).astype(np.float32), kernel)
+        steps = (inverse > 0) & (cv2.dilate(inverse, kernel) / SAME > farthest)
+        near = cv2.dilate(steps.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8))
         planes, rows, columns = _resized(torch.from_numpy(self.planes), shape)
-        inverse = planes[..., 0].numpy()
-        error = np.where(inverse > 0, self.error[rows.numpy()[:, None], columns.numpy()], 0)
+        inverse, certain = planes[..., 0].numpy(), np.where(near > 0, 0, self.error)
+        error = np.where(inverse > 0, certain[rows.numpy()[:, None], columns.numpy()], 0)
         return np.where(error > 0, inverse, 0).astype(np.float32), error.astype(np.float32)
 
 

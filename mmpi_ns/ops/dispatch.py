@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Generic, Literal, ParamSpec, TypeVar, get_type_hints
+from typing import Any, Generic, Literal, ParamSpec, TypeVar, cast, get_type_hints
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -131,7 +131,7 @@ def in_cpp(of: Operation[..., Any], least: int | None = None) -> None:
                 passed.append(hints[name](value))
                 continue
             if is_group:
-                tensors, owner = value._asdict(), type(value)
+                tensors, owner = cast(Any, value)._asdict(), type(value)
             for part, tensor in tensors.items():
                 shape, kind = annotated(owner)[part]
                 if tensor.dtype != kind:

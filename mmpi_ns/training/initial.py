@@ -127,7 +127,7 @@ def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:
         rays, batch = sources.draw(BATCH, generator(seed, i, "initial", field.density.device))
         count = len(batch["image"])
         depths = rays.metadata[PIXEL_DEPTH][:count]
-        known = (depths[:, 0] > 0).nonzero()[:, 0]
-        parts = rays.origins[known], rays.directions[known], depths[known], batch["image"][known, :3]
+        measured = (depths[:, 0] > 0).nonzero()[:, 0]
+        parts = rays.origins[measured], rays.directions[measured], depths[measured], batch["image"][measured, :3]
         votes.add(field.layout, *parts, field.plan.ray_near)
     start_from_votes(field, votes)

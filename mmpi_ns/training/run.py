@@ -109,7 +109,10 @@ class Progress(nn.Module):
 
 def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:
     """Training images whose rays the window renders."""
-    return None if views is None else views.some(cameras_of(window, views.origins.numpy()))
+    if views is None:
+        return None
+    chosen = torch.from_numpy(cameras_of(window, views.origins.numpy()))
+    return TrainingViews(views.origins[chosen], views.inward[chosen])
 
 
 @dataclass(eq=False)
