@@ -37,16 +37,15 @@ class Frames:
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
-        def column(name: str, *shape: int) -> Tensor:
-            values = torch.tensor([getattr(m, name) for m in mpis], dtype=dtype, device=device)
-            return values.reshape(len(mpis), *shape)
-
-        nears, ends = column("near"), column("last_disparity")
+        shapes = {"origin": (3,), "axes": (3, 3), "near": (), "extent": (4,), "last_disparity": ()}
+        origins, axes, nears, extents, ends = (
+            torch.tensor([getattr(m, name) for m in mpis], dtype=dtype, device=device).reshape(len(mpis), *shape)
+            for name, shape in shapes.items()
+        )
         planes = torch.tensor([m.planes for m in mpis], dtype=torch.int64, device=device)
         shares = 1.0 - nears * ends
         steps = shares / (nears * (planes - 1).to(dtype))
-        parts = column("origin", 3), column("axes", 3, 3), nears, column("extent", 4)
-        return Frames(*parts, planes, ends, shares, steps)
+        return Frames(origins, axes, nears, extents, planes, ends, shares, steps)
 
     def one(self, k: int) -> Frames:
         """Frame k alone."""

@@ -171,21 +171,19 @@ def transforms_changed(parser: ModuleType, change: Callable[[dict[str, Any], Pat
         parser.load_from_json = read  # type: ignore[attr-defined]
 
 
-class Uninterrupted:
-    """No trace function runs in this thread within the block.
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Within the block no trace function runs in this thread.
 
     The viewer stops a rendering by a trace function that raises before some line of Python. Where that line is the end
     of ``with lock:``, the lock would never be released.
     """
-
-    def __enter__(self) -> None:
-        self._trace: Any = sys.gettrace()
-        sys.settrace(None)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        sys.settrace(self._trace)
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(trace)
 
 
 @contextmanager
