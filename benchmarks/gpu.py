@@ -13,7 +13,6 @@ from apart import run_apart
 from gpu_parts import run_part
 from report import Bench, Report, Row, page, slug, table, title
 
-from mmpi_ns.bench.trainers import has_pycolmap
 from mmpi_ns.scripts.command import run
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
@@ -51,7 +50,6 @@ class Gpu(Bench):
         made, rows = report.content["made"], report.rows
         data, report.content["rehearsal"] = self._scene(), self.rehearse
         made["scene_seconds"] = time.monotonic() - start
-        made["tracks"] = "of the data set" if has_pycolmap() else "none: pycolmap is not installed"
         for number, name in enumerate(self.parts):
             left = self.seconds - (time.monotonic() - start)
             share = SHARES[name] / sum(SHARES[n] for n in self.parts[number:])
@@ -87,7 +85,7 @@ class Gpu(Bench):
         if not (folder / "transforms.json").is_file():
             print(f"Making a street of {width} x {height} pixels ...", flush=True)
             scene = make_scene("street", count=count, width=width, height=height)
-            write_dataset(scene, folder, points=points, tracks=has_pycolmap(), overwrite=True)
+            write_dataset(scene, folder, points=points, overwrite=True)
         return folder.resolve()
 
     def _part(self, name: str, data: Path, seconds: float) -> Row:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -32,6 +33,16 @@ from mmpi_ns.rendering.metrics import ImageMetrics
 
 FULL_WIDTH = 1242
 """Pixels across a frame of KITTI (375 down)."""
+
+
+def interpret(on: bool) -> None:
+    """Makes Triton's interpreter run the GPU kernels on CPU tensors. Raises ValueError if TRITON_INTERPRET=1 was not in
+    the environment when the process started, or there is no Triton."""
+    if on and os.environ.get("TRITON_INTERPRET") != "1":
+        raise ValueError("Triton's interpreter must be asked for before Python starts: set TRITON_INTERPRET=1.")
+    if on and (reason := dispatch.fault("Triton")) is not None:
+        raise ValueError(f"Triton is not available: {reason}.")
+    dispatch.interpreting = on
 
 
 def check(request: Row, tell: Tell) -> Row:
@@ -224,6 +235,6 @@ def run_part(request: Row, tell: Tell) -> Row:
     """One part, as asked."""
     if request["rehearse"]:
         torch.set_num_threads(1)
-        dispatch.interpret(True)
+        interpret(True)
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU (rehearsal by Triton's interpreter)"
     return {**PARTS[request["part"]](request, tell), "device": name}

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from random_scenes import CUBE, Scene, gradients_of, of_slots, random_scene, samples_of
+from random_scenes import CUBE, Scene, dense_grad, gradients_of, of_slots, random_scene, samples_of
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch, interpolate, variation
@@ -116,7 +116,7 @@ def interpolation(device: str, samples: int) -> list[Check]:
         if dtype == torch.float32:
             read = interpolate.interpolate(table, rows, weights)
             (read * upstream).sum().backward()
-            gradient = table.dense_grad()
+            gradient = dense_grad(table)
         else:
             read = interpolate.interpolate_densely(values := table.data.requires_grad_(), rows, weights.to(dtype))
             (gradient,) = torch.autograd.grad((read * upstream).sum(), values)
@@ -153,7 +153,7 @@ def variations(device: str, texels: int) -> list[Check]:
 
     def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
         values = table[rows].to(dtype).requires_grad_()
-        scales = [(0.5, 2.0, 1.0)] * len(field.grids)
+        scales = torch.tensor([(0.5, 2.0, 1.0)] * len(field.grids), device=device)
         value = variation.total_variation(values, table.to(dtype), rows, field.layout, scales)
         value.backward()
         assert values.grad is not None

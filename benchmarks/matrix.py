@@ -20,6 +20,7 @@ from typing import Any
 
 import tyro
 from ordinary_captures import MATRIX, STEP, Capture, write_capture
+from report import commit
 
 STEPS = 10
 MOST_MATCHED = 40
@@ -111,12 +112,6 @@ def run_command(command: list[str], folder: Path) -> dict[str, Any]:
         is_sentence = not any("Traceback" in line for line in said) and said and said[-1].startswith(f"{command[0]}: ")
         outcome = said[-1] if is_sentence else f"TRACEBACK: {said[-1] if said else process.returncode}"
     return {"outcome": outcome, "seconds": usage.ru_utime + usage.ru_stime, "gib": usage.ru_maxrss / 2**20}
-
-
-def commit() -> str:
-    """Of the code."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def report(rows: dict[str, Any]) -> str:

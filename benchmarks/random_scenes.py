@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.rendering.rendered import RenderedRays, render_rays
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
@@ -99,11 +100,18 @@ def samples_of(rendered: RenderedRays) -> tuple[list[list[tuple[int, int]]], lis
     return pairs, [t[v] for t, v in zip(tau, valid, strict=True)]
 
 
+def dense_grad(table: Table) -> Tensor | None:
+    """The gradient of all rows of a table; None if none was read. [T, C]"""
+    if table.grad_rows is None:
+        return None
+    return torch.zeros_like(table.data).index_add_(0, table.grad_rows, table.grad)  # type: ignore[arg-type]
+
+
 def gradients_of(field: MMPIField, rendered: RenderedRays, by: Array) -> dict[str, Tensor]:
     """Derivatives of the sum of ``by`` [R, 3] times the rays' colours, by every table."""
     field.zero_grad()
     rendered.colors.rgb.backward(torch.tensor(by).to(rendered.colors.rgb))
-    grads = {name: getattr(field, name).dense_grad() for name in TABLES}
+    grads = {name: dense_grad(getattr(field, name)) for name in TABLES}
     return {n: g.cpu() for n, g in grads.items() if g is not None}
 
 

@@ -11,6 +11,7 @@ import math
 import os
 import re
 import shlex
+import subprocess
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields
 from datetime import date
@@ -21,12 +22,18 @@ import torch
 
 import mmpi_ns
 import mmpi_scene
-from mmpi_ns.utils.machine import commit, processor
+from mmpi_ns.utils.machine import processor
 from mmpi_ns.utils.values import Number, check_options
 
 Row = dict[str, Any]
 Cell = str | Callable[[Row], Any]
 """How a column shows a row: a format string over the row's names, or a function of the row."""
+
+
+def commit() -> str:
+    """Short hash of the commit that the code is checked out at; "unknown" where it is installed."""
+    words = ["git", "-C", str(Path(mmpi_ns.__file__).resolve().parent), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
 
 
 @dataclass(kw_only=True)

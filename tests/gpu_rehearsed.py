@@ -9,6 +9,7 @@ import gpu
 import kernel_checks
 import torch
 from gpu import SHARES, Gpu
+from gpu_parts import interpret
 from random_scenes import random_scene
 
 from mmpi_ns.ops import dispatch
@@ -38,7 +39,7 @@ def test_all_parts_end_to_end(tmp_path, monkeypatch):
 
 
 def test_wrong_kernels_are_found(monkeypatch):
-    dispatch.interpret(True)
+    interpret(True)
     assert all(c.ok for c in kernel_checks.interpolation("cpu", 50))
     wrong = {
         "sum_rows": lambda _, values, w, count: torch.zeros(count, values.shape[1]),

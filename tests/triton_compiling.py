@@ -127,7 +127,7 @@ def all_launches(setattr, shapes=SMALL):
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
     march = importlib.import_module("mmpi_ns.ops.march.gpu")
-    setattr(dispatch, "_interpreting", True)
+    setattr(dispatch, "interpreting", True)
     setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.operations()]))
     with launches_noted({}) as noted:
         for name, cases in trial.CASES.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,18 +42,12 @@ def train_words(
         seed: of every random draw.
         device: cpu or cuda.
     """
-    tracks = NO_TRACKS if method.startswith("mmpi") and not has_pycolmap() else ()
-    words = [method, *options, *tracks, "--machine.seed", str(seed)]
+    words = [method, *options, "--machine.seed", str(seed)]
     words += ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
     words += ["--machine.device-type", device, "--max-num-iterations", str(steps), "--steps-per-save", str(10**9)]
     words += [word for what in ("batch", "image", "all-images") for word in (f"--steps-per-eval-{what}", "0")]
     words += ["--logging.profiler", "none", "--logging.local-writer.enable", "False", "--data", str(scene.data)]
     return [*words, "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
-
-
-def has_pycolmap() -> bool:
-    """Whether a COLMAP model can be read, and features be triangulated."""
-    return importlib.util.find_spec("pycolmap") is not None
 
 
 def config_of(words: Sequence[str]) -> Any:

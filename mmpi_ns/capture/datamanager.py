@@ -26,8 +26,7 @@ from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
-from mmpi_ns.capture.moving import moving_masks, share_of_moving
-from mmpi_ns.capture.moving_picture import draw_moving
+from mmpi_ns.capture.moving import draw_moving, moving_masks, share_of_moving
 from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import drop_masked, observe, posed_images
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains

@@ -43,6 +43,8 @@ NO_MASK = "no mask"
 """Name of the mask file of a frame that has none where others have one: nerfstudio's parser knows all or none."""
 FAR = 10.0
 """Cameras this many times as far from the origin as from each other get a local origin."""
+IDENTITY = np.eye(4)[:3]
+"""Transform of a file that names none."""
 GRAY = 128
 """Gray level of points without colours."""
 
@@ -211,7 +213,8 @@ class LocalOrigin:
         """Subtracts the local origin from poses of a transforms.json or a COLMAP model that are far from the origin."""
         poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=np.float64)
         centers = poses[:, :3, 3]
-        self.place, self.applied = centers.mean(0), self._applied(meta)[:, 3]
+        applied = np.array(meta.get("applied_transform", IDENTITY), np.float64)
+        self.place, self.applied = centers.mean(0), applied[:, 3]
         extent = float(np.ptp(centers, axis=0).max())
         self.taken = bool(max(np.abs(self.place).max(), np.abs(self.applied).max()) > FAR * extent)
         self._meta = meta
@@ -220,13 +223,9 @@ class LocalOrigin:
             for frame, pose in zip(meta["frames"], poses, strict=True):
                 frame["transform_matrix"] = pose.tolist()
             if "applied_transform" in meta:
-                meta["applied_transform"] = np.c_[self._applied(meta)[:, :3], np.zeros(3)].tolist()
+                meta["applied_transform"] = np.c_[applied[:, :3], np.zeros(3)].tolist()
             place = ", ".join(f"{x:.10g}" for x in self.place)
             say_once(f"{source} has map coordinates: they are taken from ({place}).")
-
-    @staticmethod
-    def _applied(meta: dict[str, Any]) -> NDArray[np.float64]:
-        return np.array(meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)
 
     def tell(self, outputs: DataparserOutputs) -> DataparserOutputs:
         """Gives the transform from the capture's own coordinates, in float64, for the points of a model."""
@@ -234,7 +233,8 @@ class LocalOrigin:
             return outputs
         transform = outputs.dataparser_transform.double().numpy().copy()
         # The parser adds an applied_transform where the file has none.
-        to_file = np.linalg.solve(self._applied(self._meta)[:, :3], self.applied - self.place)
+        applied = np.array(self._meta.get("applied_transform", IDENTITY), np.float64)
+        to_file = np.linalg.solve(applied[:, :3], self.applied - self.place)
         transform[:, 3] += transform[:, :3] @ to_file
         return MapOutputs(**{**vars(outputs), "dataparser_transform": torch.from_numpy(transform)})
 

@@ -123,7 +123,7 @@ def measure(
     for rows in strips(start.shape):
         at, correlations = (torch.from_numpy(x[rows]), torch.from_numpy(y[rows])), torch.from_numpy(alike[rows])
         counted = torch.from_numpy(usable[rows])
-        solved = solve_matches(*at, correlations, counted, *parallax.tensors, rows.start, NOISE, MAX_EPIPOLAR)
+        solved = solve_matches(*at, correlations, counted, *parallax.tensors, rows.start, NOISE**2, MAX_EPIPOLAR**2)
         inverse[rows], weight[rows] = (values.numpy() for values in solved)
     return inverse, weight
 
@@ -159,10 +159,10 @@ def fuse(inverse: Sequence[Map], weight: Sequence[Map]) -> Depth:
     """
     depth = Depth(*np.empty((2, *inverse[0].shape), np.float32))
     for rows in strips(inverse[0].shape):
-        q, certainty = (torch.from_numpy(np.stack([x[rows].ravel() for x in each])) for each in (inverse, weight))
+        q, certainty = (torch.from_numpy(np.stack([x[rows] for x in each])) for each in (inverse, weight))
         averaged = average_matches(q, certainty, MAX_RELATIVE)
         for values, average in zip((depth.inverse, depth.error), averaged, strict=True):
-            values[rows] = average.numpy().reshape(-1, values.shape[1])
+            values[rows] = average.numpy()
     return depth
 
 
@@ -251,8 +251,14 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     for factor in rounds or (SEARCHED if surfaces else ROUNDS)[is_large]:
         if factor > 1 and min(view.gray.shape) < LEAST_FLOW * factor:
             continue
-        if depth is not None:
-            rough = pulled(rough, depth)
+        if depth is not None:  # rough depths are pulled towards measured ones nearby, from coarse to fine
+            rough = np.asarray(cv2.resize(rough, depth.inverse.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
+            relative = depth.error / np.maximum(depth.inverse, 1e-12)
+            weight = np.where(depth.inverse > 0, 1 / np.maximum(relative, 0.01), 0).astype(np.float32)
+            for side in (65, 33, 17, 9):
+                near = _mean(weight, side)
+                share = near / (near + PRIOR_ERROR)
+                rough = share * _mean(weight * depth.inverse, side) / np.maximum(near, 1e-9) + (1 - share) * rough
         small = view.reduced(factor)
         rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         of_view = mean_and_contrast(small.gray)
@@ -264,22 +270,10 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
 
 def filled(depth: Depth, surfaces: Surfaces) -> Depth:
     """Measured depths, and those of planes where hardly any is measured."""
-    is_measured, (inverse, error) = depth.inverse > 0, surfaces.without_edges().enlarged(depth.inverse.shape)
+    is_measured, (inverse, error) = depth.inverse > 0, surfaces.enlarged(depth.inverse.shape)
     side = 2 * int(max(is_measured.shape) * AROUND / 2) + 1
     is_bare = ~is_measured & (_mean(is_measured.astype(np.float32), side) < MEASURED)
     return Depth(np.where(is_bare, inverse, depth.inverse), np.where(is_bare, error, depth.error))
-
-
-def pulled(rough: Map, depth: Depth) -> Map:
-    """Rough inverse depths, pulled towards measured ones nearby, from coarse to fine; of their size."""
-    rough = np.asarray(cv2.resize(rough, depth.inverse.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
-    relative = depth.error / np.maximum(depth.inverse, 1e-12)
-    weight = np.where(depth.inverse > 0, 1 / np.maximum(relative, 0.01), 0).astype(np.float32)
-    for side in (65, 33, 17, 9):
-        near = _mean(weight, side)
-        share = near / (near + PRIOR_ERROR)
-        rough = share * _mean(weight * depth.inverse, side) / np.maximum(near, 1e-9) + (1 - share) * rough
-    return rough
 
 
 def without_fringes(view: View, depth: Depth) -> Depth:

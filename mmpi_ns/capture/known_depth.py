@@ -194,18 +194,18 @@ def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
     return KnownDepth(Computed(len(arrays), read))
 
 
-def with_sensor(known: KnownDepth, files: list[Path], unit: float, posed: PosedImages) -> KnownDepth:
+def with_sensor(depths: KnownDepth, files: list[Path], unit: float, posed: PosedImages) -> KnownDepth:
     """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept.
 
     Args:
-        known: depths from other sources.
+        depths: those of other sources.
         files: depth image of each training image.
         unit: length of a depth of 1, scene units.
         posed: the training images.
     """
 
     def replaced(i: int) -> Codes:
-        codes = known.codes[i]
+        codes = depths.codes[i]
         shape = codes.shape[0], codes.shape[1]
         size = shown_size(size_of(posed.files[i]), posed.sizes[i]).astype(int).tolist()
         depth = read_depth_image(files[i], unit)  # along the optical axis
@@ -258,7 +258,7 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
     return distances
 
 
-def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
+def with_continued(depths: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
     Masked pixels have no distance: what moves is nowhere.
@@ -266,7 +266,7 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, 
 
     def codes_of(i: int) -> Codes:
         """Computed for every n-th pixel of a large image."""
-        codes, hidden = np.array(known.codes[i]), ~dataset.usable(i)
+        codes, hidden = np.array(depths.codes[i]), ~dataset.usable(i)
         codes[hidden] = UNKNOWN
         step = -(-max(codes.shape[:2]) // CONTINUED)
         rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
@@ -284,16 +284,16 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, 
         codes[hidden] = UNKNOWN
         return codes
 
-    count = len(known.codes)
+    count = len(depths.codes)
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
-    contents = [digest((), codes) for codes in known.codes]
+    contents = [digest((), codes) for codes in depths.codes]
     key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
     work = "Extrapolating surfaces"
     return _from_cache(key, lambda: track(in_order(codes_of, range(count)), work, count, console=CONSOLE))
 
 
-def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
+def of_cells(observations: Observations, depths: KnownDepth, dataset: MMPIDataset) -> Observations:
     """The observations that placement weighs: of each image cell the pixel with the most certain depth.
 
     Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then draw MPIs and texels
@@ -301,7 +301,7 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
     """
 
     def points_of(i: int) -> NDArray[np.float64]:
-        depth = known.image(i)
+        depth = depths.image(i)
         height, width = depth.shape[:2]
         side = max(1, -(-max(height, width) // CELLS))
         relative = np.full((-(-height // side) * side, -(-width // side) * side), np.inf, np.float32)
@@ -318,7 +318,7 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
         rays = dataset.cameras.generate_rays(torch.full((len(rows), 1), i), coords=coords)
         return observations.centers[i] + rays.directions.double().numpy() / depth[rows, columns, :1]
 
-    points = list(in_order(points_of, range(len(known.codes))))
+    points = list(in_order(points_of, range(len(depths.codes))))
     cells = np.concatenate(points)
     if not len(cells):
         return observations
@@ -333,7 +333,7 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
     )
 
 
-def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
+def with_points(depths: KnownDepth, observations: Observations) -> KnownDepth:
     """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
     cameras, points = observations.tracked
     distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
@@ -341,11 +341,11 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
     columns, rows = observations.seen_at.astype(int).T
 
     def added(i: int) -> Codes:
-        codes = np.array(known.codes[i])
+        codes = np.array(depths.codes[i])
         inside = (rows >= 0) & (rows < codes.shape[0]) & (columns >= 0) & (columns < codes.shape[1])
         chosen = np.nonzero((cameras == i) & inside & (distance > 0))[0]
         chosen = chosen[np.argsort(-distance[chosen], kind="stable")]  # the last one written stays
         codes[rows[chosen], columns[chosen]] = inverse[chosen]
         return codes
 
-    return KnownDepth(Computed(len(known.codes), added))
+    return KnownDepth(Computed(len(depths.codes), added))

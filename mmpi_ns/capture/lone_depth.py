@@ -88,11 +88,7 @@ def _planes(
         (xy * yz - xz * yy, xy * xz - xx * yz, xx * yy - xy * xy),
     )
     determinant = xx * cofactors[0][0] + xy * cofactors[0][1] + xz * cofactors[0][2]
-
-    def solved(vector: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
-        return [_dot(row, vector) / determinant for row in cofactors]
-
-    plane, spread = solved(right), solved(directions)
+    plane, spread = ([_dot(row, vector) / determinant for row in cofactors] for vector in (right, directions))
     scatter, value = np.maximum(squares - _dot(plane, right), 0), _dot(plane, directions)
     leverage = np.maximum(_dot(spread, directions), 1)
     return value, np.sqrt((scatter + (0.2 * LEAST_ERROR * value) ** 2) * leverage)

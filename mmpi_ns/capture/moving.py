@@ -8,9 +8,10 @@ pass looks again near images in which something moves, without what moves in the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -55,6 +56,10 @@ VERSION = 10
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
+SHOWN, COLUMNS, WIDTH = 24, 4, 320
+"""Images in the picture for reports, those in a row, and pixels across each."""
+RED = (0, 0, 127)
+"""Blue, green, red that half of a masked pixel's colour is replaced by."""
 
 
 def find_moving(
@@ -156,6 +161,32 @@ def share_of_moving(masks: Sequence[Mask]) -> str:
         f"{100 * shares.mean():.1f} % of the training pixels, in {count} of {len(masks)} images, show what moves and "
         "are masked"
     )
+
+
+def draw_moving(path: Path, images: Iterable[tuple[str, NDArray[np.uint8]]], masks: Sequence[Mask]) -> None:
+    """Writes the images in which most moves, in order, with what moves in red.
+
+    Args:
+        path: file of the picture; its folder is made.
+        images: name, and blue, green and red of each image [H, W, 3].
+        masks: what moves in each image [H, W]; something in at least one.
+    """
+    shares = [float(mask.mean()) for mask in masks]
+    most = {i for i in sorted(range(len(masks)), key=lambda i: -shares[i])[:SHOWN] if shares[i] > 0}
+    tiles = []
+    for name, color, mask in ((*image, masks[i]) for i, image in enumerate(images) if i in most):
+        shown = color.copy()
+        shown[mask] = shown[mask] // 2 + np.array(RED, np.uint8)
+        height = round(WIDTH * color.shape[0] / color.shape[1])
+        tile = np.asarray(cv2.resize(shown, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
+        cv2.putText(tile, name, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 255, 255), 1)
+        tiles.append(tile)
+    height = max(tile.shape[0] for tile in tiles)
+    tiles = [cv2.copyMakeBorder(t, 0, height - t.shape[0], 0, 0, cv2.BORDER_CONSTANT) for t in tiles]
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
+    rows = [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.vstack(rows))
 
 
 def gain_of(shot: Shot, other: Shot) -> NDArray[np.float64]:

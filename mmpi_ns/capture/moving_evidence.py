@@ -138,9 +138,13 @@ def splat(shot: Shot, other: Shot) -> Map:
     """Inverse depths at the pixels of a shot from those of another one, the nearest of several in a square. [h, w]"""
     height, width = shot.view.gray.shape
     every = np.s_[::SPARSE, ::SPARSE]
-    known = np.nonzero(other.depth.inverse[every])
-    inverse, parallax = other.depth.inverse[every][known], Parallax.between(other.view, shot.view)
-    a, b, (y, x) = parallax.linear.astype(np.float32), parallax.b, (SPARSE * c.astype(np.float32) + 0.5 for c in known)
+    measured = np.nonzero(other.depth.inverse[every])
+    inverse, parallax = other.depth.inverse[every][measured], Parallax.between(other.view, shot.view)
+    a, b, (y, x) = (
+        parallax.linear.astype(np.float32),
+        parallax.b,
+        (SPARSE * c.astype(np.float32) + 0.5 for c in measured),
+    )
     right, down, ahead = (m[0] * x + m[1] * y + (m[2] + inverse * shift) for m, shift in zip(a, b, strict=True))
     shown = (ahead > 0) & (right >= 0) & (right < width * ahead) & (down >= 0) & (down < height * ahead)
     right, down, ahead, inverse = (part[shown] for part in (right, down, SPARSE * ahead, inverse))

@@ -81,24 +81,18 @@ def upright_objects(
     result = [np.zeros_like(mask) for mask in masks]
     if not any(mask.any() for mask in masks):
         return result
-    halves = list(pool.map(Half.of, shots, masks))
-
-    def seen_in(i: int) -> list[tuple[int, int, Mask]]:
-        nearest = near[i][:AFTER]
-        if not any(turned(shots[i].view, shots[j].view) for j in nearest):
-            return []
-        return [(j, label, part) for j in nearest for label, part in objects_in(halves[i], halves[j])]
-
-    seen = list(pool.map(seen_in, range(len(shots))))
-    moved = [half.objects > 0 for half in halves]
-    again = {
-        (j, label) for i, of_shot in enumerate(seen) for j, label, part in of_shot if moved[i][part].mean() > AGAIN
-    }
-    for i, of_shot in enumerate(seen):
-        parts = [part for j, label, part in of_shot if (j, label) in again]
+    halves, pairs = list(pool.map(Half.of, shots, masks)), []
+    for i, nearest in enumerate(others[:AFTER] for others in near):
+        if any(turned(shots[i].view, shots[j].view) for j in nearest):
+            pairs += [(i, j) for j in nearest]
+    objects = pool.map(lambda pair: objects_in(halves[pair[0]], halves[pair[1]]), pairs)
+    seen = [(i, (j, label), part) for (i, j), parts in zip(pairs, objects, strict=True) for label, part in parts]
+    again = {mover for i, mover, part in seen if (halves[i].objects[part] > 0).mean() > AGAIN}
+    for i, size in enumerate(mask.shape[::-1] for mask in masks):
+        parts = [part for shot, mover, part in seen if shot == i and mover in again]
         if parts:
             every = np.any(parts, axis=0).astype(np.uint8)
-            result[i] = cv2.resize(every, result[i].shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+            result[i] = cv2.resize(every, size, interpolation=cv2.INTER_NEAREST) > 0
     return result
 
 

@@ -183,7 +183,10 @@ def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int,
     result |= columns_of & (y >= np.minimum(first, body)) & (y <= last) & ~static
     closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     _, labels = cv2.connectedComponents(closed)
-    whole = without_holes(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])))
+    # With all that the closed parts enclose.
+    outside = ~np.pad(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])), 1)
+    _, labels = cv2.connectedComponents(outside.astype(np.uint8), connectivity=4)
+    whole = (labels != labels[0, 0])[1:-1, 1:-1]
     return whole if part.sum() > CORE * (whole.sum() + (whole & judged).sum()) / 2 else np.zeros_like(whole)
 
 
@@ -203,13 +206,6 @@ def _cut(color: NDArray[np.uint8], surely: Mask, perhaps: Mask) -> Mask:
         cv2.grabCut(small, labels, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
     objects = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.float32)
     return cv2.resize(objects, surely.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
-
-
-def without_holes(mask: Mask) -> Mask:
-    """A mask and all that it encloses."""
-    outside = cv2.copyMakeBorder((~mask).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(1.0,))
-    _, labels = cv2.connectedComponents(outside, connectivity=4)
-    return (labels != labels[0, 0])[1:-1, 1:-1]
 
 
 def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> Mask:

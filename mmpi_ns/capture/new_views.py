@@ -132,7 +132,7 @@ class ShownImage:
 def find_shared_points(
     dataset: MMPIDataset,
     posed: PosedImages,
-    known: KnownDepth,
+    depths: KnownDepth,
     rays: Rays,
     images: Sequence[int],
     seed: int,
@@ -144,7 +144,7 @@ def find_shared_points(
     Args:
         dataset: the training images.
         posed: their cameras.
-        known: depths of their pixels.
+        depths: depths of their pixels.
         rays: makes rays through pixel centres (image, row, column).
         images: numbers of the images to compare.
         seed: of the choice among more than ``MOST`` pixels.
@@ -156,7 +156,7 @@ def find_shared_points(
     """
     # Neighbours mostly stand side by side.
     show = held(
-        lambda i: ShownImage.of(*image_and_mask(dataset, i), known.image(i)),
+        lambda i: ShownImage.of(*image_and_mask(dataset, i), depths.image(i)),
         posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1,
     )  # fmt: skip
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
@@ -170,7 +170,7 @@ def find_shared_points(
         return None
     joined = (torch.cat(column).to(device) for column in zip(*parts, strict=True))
     centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float().to(device)
-    cover = matches / sum(known.codes[i][..., 0].size for i in images)
+    cover = matches / sum(depths.codes[i][..., 0].size for i in images)
     return SharedPoints(*joined, centers=centers, cover=cover)
 
 

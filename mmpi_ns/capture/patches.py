@@ -63,20 +63,16 @@ class Surfaces:
         """Inverse depths where a plane is certain, else 0. [h, w]"""
         return np.where(self.error > 0, self.planes[..., 0], 0).astype(np.float32)
 
-    def without_edges(self) -> Surfaces:
-        """The same without the pixels next to a step in depth: patches reach across it."""
-        inverse, kernel = self.inverse, np.ones((3, 3), np.uint8)
-        nearest = cv2.dilate(inverse, kernel)
-        farthest = cv2.erode(np.where(inverse > 0, inverse, np.inf).astype(np.float32), kernel)
-        steps = (inverse > 0) & (nearest / SAME > farthest)
-        near = cv2.dilate(steps.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8))
-        return Surfaces(self.planes, np.where(near > 0, 0, self.error))
-
     def enlarged(self, shape: tuple[int, ...]) -> tuple[Map, Map]:
-        """Inverse depths and errors of an image of another size; both 0 where no plane is certain. [H, W] each"""
+        """Inverse depths and errors of an image of another size; both 0 where no plane is certain, and next to a step
+        in depth, across which patches reach. [H, W] each"""
+        inverse, kernel = self.inverse, np.ones((3, 3), np.uint8)
+        farthest = cv2.erode(np.where(inverse > 0, inverse, np.inf).astype(np.float32), kernel)
+        steps = (inverse > 0) & (cv2.dilate(inverse, kernel) / SAME > farthest)
+        near = cv2.dilate(steps.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8))
         planes, rows, columns = _resized(torch.from_numpy(self.planes), shape)
-        inverse = planes[..., 0].numpy()
-        error = np.where(inverse > 0, self.error[rows.numpy()[:, None], columns.numpy()], 0)
+        inverse, certain = planes[..., 0].numpy(), np.where(near > 0, 0, self.error)
+        error = np.where(inverse > 0, certain[rows.numpy()[:, None], columns.numpy()], 0)
         return np.where(error > 0, inverse, 0).astype(np.float32), error.astype(np.float32)
 
 
@@ -99,10 +95,11 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
     for divisor, rounds, change in LEVELS:
         factor = divisor * smallest
         small = view.reduced(factor)
-        shape, gray = small.gray.shape, _pixels(small)
+        shape, gray = small.gray.shape, torch.from_numpy(small.gray)
         parallax = [Parallax.between(small, other.reduced(factor)).tensors for other in others]
         linear, b = (torch.stack(parts) for parts in zip(*parallax, strict=True))
-        grays = [[_pixels(other.reduced(f)) for f in (max(1.0, factor / 2), factor, 2 * factor)] for other in others]
+        sizes = (max(1.0, factor / 2), factor, 2 * factor)
+        grays = [[torch.from_numpy(other.reduced(size).gray) for size in sizes] for other in others]
         compared, pinhole = others_of(grays, linear, b), torch.from_numpy(small.pinhole).float()
         if patches is None:
             start = torch.zeros(*shape, 3)
@@ -119,10 +116,6 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
             patches = spread_planes(gray, patches, changes, pinhole, compared, STRIDE, offset)
     assert patches is not None
     return _certain(small, [other.reduced(smallest) for other in others], patches)
-
-
-def _pixels(view: View) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(view.gray))
 
 
 def _random_planes(rough: Map, shape: tuple[int, ...], pinhole: Tensor, random: torch.Generator) -> Tensor:
@@ -155,23 +148,9 @@ def _resized(planes: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor, Te
 def _certain(view: View, others: Sequence[View], patches: Patches) -> Surfaces:
     """The planes that are alike, close to those around them, and precise enough."""
     planes = patches.planes.numpy()
-    inverse = np.ascontiguousarray(planes[..., 0])
-    error = NOISE / np.maximum(_parallax(view, others, inverse), 1e-12)
-    middle = cv2.medianBlur(inverse, 5)
-    kept = (patches.alike.numpy() > MIN_ALIKE) & view.inside & (error < MAX_RELATIVE * inverse)
-    kept &= (inverse < SAME * middle) & (middle < SAME * inverse)
-    # OpenCV's filter takes integers; one step of depth is 16.
-    octaves = np.log(np.maximum(inverse, 1e-30)) / np.log(SAME)
-    octaves -= octaves[kept].min(initial=0) - 1
-    steps = np.where(kept, (16 * octaves).clip(16, 32000), -16).astype(np.int16)
-    cv2.filterSpeckles(steps, -16, SPECK, 16)
-    return Surfaces(planes, np.where(steps > 0, error, 0).astype(np.float32))
-
-
-def _parallax(view: View, others: Sequence[View], inverse: Map) -> Map:
-    """Pixels of motion for each unit of inverse depth in the second best of the other views that show it, or in the one
-    that does. [h, w]"""
-    change = np.maximum(1e-3 * inverse, 1e-12)
+    inverse: Map = np.ascontiguousarray(planes[..., 0])
+    # Pixels of motion for each unit of inverse depth in the second best view that shows it, or in the one that does.
+    change: Map = np.maximum(1e-3 * inverse, 1e-12)
     best, second = np.zeros((2, *inverse.shape), np.float32)
     for other in others:
         parallax = Parallax.between(view, other)
@@ -182,4 +161,13 @@ def _parallax(view: View, others: Sequence[View], inverse: Map) -> Map:
         moved = np.where(shown, np.hypot(moved_x - x, moved_y - y) / change, 0)
         second = np.maximum(second, np.minimum(best, moved))
         best = np.maximum(best, moved)
-    return np.where(second > 0, second, best)
+    error = NOISE / np.maximum(np.where(second > 0, second, best), 1e-12)
+    middle = cv2.medianBlur(inverse, 5)
+    kept = (patches.alike.numpy() > MIN_ALIKE) & view.inside & (error < MAX_RELATIVE * inverse)
+    kept &= (inverse < SAME * middle) & (middle < SAME * inverse)
+    # OpenCV's filter takes integers; one step of depth is 16.
+    octaves = np.log(np.maximum(inverse, 1e-30)) / np.log(SAME)
+    octaves -= octaves[kept].min(initial=0) - 1
+    steps = np.where(kept, (16 * octaves).clip(16, 32000), -16).astype(np.int16)
+    cv2.filterSpeckles(steps, -16, SPECK, 16)
+    return Surfaces(planes, np.where(steps > 0, error, 0).astype(np.float32))

@@ -40,7 +40,7 @@ from mmpi_ns.utils.parallel import in_order
 NEIGHBOURS, MAX_ANGLE = 6, 40.0
 """Nearest views that each image is compared with, and the largest angle in degrees between their directions."""
 BYTES_OF_VIEW = 21
-"""Of a pixel of an ``ExposedView`` and its depths."""
+"""Of a pixel of an ``ExposedView``."""
 HIDDEN = 0.3
 """Log ratio from the median beyond which another surface is taken to hide one, where distances are not known."""
 
@@ -168,8 +168,8 @@ class ExposedView:
     """Means over windows."""
     exposed: Bool[ndarray, "H W"]
     """Where no pixel of the window is dark, clipped or masked."""
-    inverse_distance: Float[ndarray, "H W"] | None
-    """0 where it is not known; None if that of no pixel is."""
+    depth: Float[ndarray, "H W 2"] | None
+    """Inverse distances, 0 where unknown, and their errors; None if that of no pixel is known."""
     number: int
     """Among the cameras."""
 
@@ -177,7 +177,7 @@ class ExposedView:
     def of(
         image: UInt8[ndarray, "H W C"],
         usable: UInt8[ndarray, "H W"],
-        distance: Float[ndarray, "H W"] | None,
+        depth: Float[ndarray, "H W 2"] | None,
         number: int,
     ) -> ExposedView:
         """Of an image, where a mask does not hide it."""
@@ -188,7 +188,7 @@ class ExposedView:
         exposed = (lit > 0) & (unclipped > 0) & (cv2.erode(usable, kernel) > 0)
         border = WINDOW // 2
         exposed[:border] = exposed[-border:] = exposed[:, :border] = exposed[:, -border:] = False
-        return ExposedView(colors, exposed, distance, number)
+        return ExposedView(colors, exposed, depth, number)
 
 
 def pair_ratios(
@@ -200,19 +200,19 @@ def pair_ratios(
 ) -> ColorRatios | None:
     """Colours of surfaces, at pixels (row, column) of one image, in another; None if it shows too few of them.
 
-    If ``second`` has no distances, what it shows instead of a surface is told by colour.
+    If ``second`` has no depths, what it shows instead of a surface is told by colour.
     """
     rows, columns = pixels.T
     at = project(cameras, second.number, points)
     shown = look_up(second.exposed.view(np.uint8), *at.T, nearest=True) > 0
-    if second.inverse_distance is not None:
+    if second.depth is not None:
         center = cameras.camera_to_worlds[second.number, :, 3]
         expected = 1 / np.maximum(np.linalg.norm(points - center, axis=-1), 1e-12)
-        inverse = look_up(second.inverse_distance, *at.T, nearest=True)
+        inverse = look_up(second.depth[..., 0], *at.T, nearest=True)
         shown &= np.abs(inverse - expected) < SAME_DISTANCE * expected
     chosen = np.nonzero(shown)[0]
     ratios = np.log(look_up(second.colors, *at[chosen].T) / first.colors[rows[chosen], columns[chosen]])
-    if second.inverse_distance is None and len(chosen):
+    if second.depth is None and len(chosen):
         chosen, ratios = (x[np.abs(ratios - np.median(ratios, 0)).max(-1) < HIDDEN] for x in (chosen, ratios))
     places = np.stack([columns, rows], -1)[chosen] + 0.5
     sizes = [np.array(view.exposed.shape[::-1]) for view in (first, second)]
@@ -238,24 +238,23 @@ def color_ratios(
         image_of: colours [H, W, C] of an image, and where it may be used [H, W].
         seed: of the draw of pixels.
     """
-
-    def prepared(i: int) -> tuple[ExposedView, NDArray[np.float32]]:
-        depth = depths.image(i)
-        return ExposedView.of(*image_of(i), depth[..., 0], i), depth
-
-    view_of = held(prepared, cameras.sizes, BYTES_OF_VIEW, NEIGHBOURS + 1)
+    view_of = held(
+        lambda i: ExposedView.of(*image_of(i), depths.image(i), i), cameras.sizes, BYTES_OF_VIEW, NEIGHBOURS + 1
+    )
 
     def ratios_of(i: int) -> list[ColorRatios | None]:
-        (view, depth), rng = view_of(i), np.random.default_rng((seed, i))
-        certain = np.argwhere(view.exposed & (depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]))
+        view, rng = view_of(i), np.random.default_rng((seed, i))
+        assert view.depth is not None
+        inverse, error = view.depth[..., 0], view.depth[..., 1]
+        certain = np.argwhere(view.exposed & (inverse > 0) & (error < CERTAIN * inverse))
         pixels = certain[rng.choice(len(certain), min(SAMPLES, len(certain)), replace=False)]
         if len(pixels) < FEWEST:
             return []
         numbers = torch.from_numpy(np.concatenate([np.full((len(pixels), 1), i), pixels], -1))
         directions = rays(numbers).directions.double().cpu().numpy()
-        points = cameras.camera_to_worlds[i, :, 3] + directions / depth[pixels[:, 0], pixels[:, 1], :1]
+        points = cameras.camera_to_worlds[i, :, 3] + directions / inverse[pixels[:, 0], pixels[:, 1], None]
         others = nearest_views(cameras.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, apart=False)
-        return [pair_ratios(view, view_of(j)[0], cameras, pixels, points) for j in others]
+        return [pair_ratios(view, view_of(j), cameras, pixels, points) for j in others]
 
     ratios: list[ColorRatios] = []
     for i, parts in enumerate(in_order(ratios_of, range(len(cameras.files)))):

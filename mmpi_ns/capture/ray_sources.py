@@ -127,13 +127,6 @@ class PixelPool:
         depths = nothing if self.depths is None else unpacked(self.depths[chosen])
         return self.colors[chosen].float() / 255, indices, depths
 
-    def of_images(self, images: Int[Tensor, "A"]) -> PixelPool:
-        """Draws from some of the images, given by their numbers. Raises InputError if they have no pixel here."""
-        kept = (torch.isin(self.images, images.to(self.images)) & (self.ends > self.begins)).nonzero()[:, 0]
-        if not len(kept):
-            raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
-        return replace(self, **{name: getattr(self, name)[kept] for name in ("images", "widths", "begins", "ends")})
-
     @property
     def nbytes(self) -> int:
         """Bytes of the pixels themselves."""
@@ -194,14 +187,17 @@ class RaySources:
 
     def of_images(self, images: NDArray[np.int64]) -> RaySources:
         """The sources of some images. Raises InputError if masks leave them no pixel."""
-        numbers, keypoints = torch.from_numpy(images), self.keypoints
+        numbers, keypoints, pool = torch.from_numpy(images), self.keypoints, self.pixels
+        left = (torch.isin(pool.images, numbers.to(pool.images)) & (pool.ends > pool.begins)).nonzero()[:, 0]
+        if not len(left):
+            raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
         if keypoints is not None and keypoints.camera_indices is not None:
             cameras = keypoints.camera_indices[:, 0]
             kept = torch.isin(cameras, numbers.to(cameras)).nonzero()[:, 0]
             keypoints = keypoints[kept] if len(kept) else None
         return replace(
             self,
-            pixels=self.pixels.of_images(numbers),
+            pixels=replace(pool, **{n: getattr(pool, n)[left] for n in ("images", "widths", "begins", "ends")}),
             new_views=self.new_views and self.new_views.of_images(numbers),
             keypoints=keypoints,
             no_new_views=self.no_new_views if self.new_views is None else "no two of these images show a point alike",

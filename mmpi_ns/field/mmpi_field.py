@@ -252,15 +252,15 @@ class MMPIField(TexelTables):
             feature_weight: of colours and features.
             chroma_times: how many times more than they already do differences of chroma count in the gradient.
         """
-        total, scales = self.density.new_zeros(()), []
-        features = lookup.features
+        total, features = self.density.new_zeros(()), lookup.features
         if chroma_times > 0 and features.requires_grad:
             features = features.view_as(features)  # a node of its own: the hook sees this loss's gradient alone
             features.register_hook(lambda gradient: with_chroma(gradient, chroma_times))
-        for k, grid in enumerate(self.grids):
-            side = max(grid.width, grid.height)
-            sides = (side, side, grid.depth) if k < len(self.plan.mpis) else (grid.width, grid.height, grid.depth)
-            scales.append((sides[0] / 128, sides[1] / 128, sides[2] / 128))
+        if (scales := self.cached("resolution")) is None:
+            longest = ((max(grid.width, grid.height), grid) for grid in self.grids)
+            sides = [(g.width, g.height, g.depth) if g.is_cube else (side, side, g.depth) for side, g in longest]
+            resolution = torch.tensor(sides, dtype=torch.float32, device=total.device) / 128
+            scales = self.cached("resolution", lambda: resolution)
         for table, values, weight in (
             (self.density, lookup.density, density_weight),
             (self.features, features, feature_weight),

@@ -141,8 +141,7 @@ class TexelTables(Field):
         and an empty one stays empty then. Otherwise a rim of tiles would be stored again each time.
         """
         plan, least = self.full_plan.scaled(factor), MIDDLE if factor > 1 else 0.0
-        tiles = grown_tiles(self.grids, head_grids(plan), self._is_cube, self._reachable(plan), least)
-        return tiles.to(self.density.device)
+        return grown_tiles(self.grids, head_grids(plan), self._reachable(plan), least).to(self.density.device)
 
     @torch.no_grad()
     def grow(self, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
@@ -153,12 +152,12 @@ class TexelTables(Field):
             tiles: to store, of ``tiles_at(factor)``; None: those.
         """
         tiles = self.tiles_at(factor) if tiles is None else tiles
-        old, is_cube, self.plan, self.factor = self.grids, self._is_cube, self.full_plan.scaled(factor), factor
+        old, self.plan, self.factor = self.grids, self.full_plan.scaled(factor), factor
         new = head_grids(self.plan, tiles)
         for name in TABLES:
             table = getattr(self, name)
-            replace_data(table, resample(table.data, old, new, is_cube, EMPTY[name]))
-        touched = resample(self.touched[:, None].float(), old, new, is_cube)
+            replace_data(table, resample(table.data, old, new, EMPTY[name]))
+        touched = resample(self.touched[:, None].float(), old, new)
         self.tiles, self.touched = tiles, (touched[:, 0] > 0).to(torch.uint8)
         self.texel_factor.fill_(factor)
         self._packed = {}
@@ -167,15 +166,15 @@ class TexelTables(Field):
     @torch.no_grad()
     def copy_finely(self, chosen: Bool[Tensor, "T"]) -> None:
         """Puts finer copies of the MPIs before all heads, which hold the chosen tiles (``tiles_with_copies``)."""
-        old, copies, is_cube = self.grids, self.copy_grids(), self._is_cube
-        fine, kept = tiles_with_copies(old, copies, chosen)
-        copies = self.copy_grids(number_tiles(fine))
+        grids, copies = self.grids, self.copy_grids()
+        fine, kept = tiles_with_copies(grids, copies, chosen)
+        mpis, copies = grids[: len(copies)], self.copy_grids(number_tiles(fine))
         remaining = self.tiles[kept].to(torch.int64)
         for name in TABLES:
             table = getattr(self, name)
-            finer = resample(table.data, old[: len(copies)], copies, is_cube[: len(copies)], EMPTY[name])
+            finer = resample(table.data, mpis, copies, EMPTY[name])
             replace_data(table, torch.cat([finer, take_bricks(table.data, remaining)]))
-        touched = resample(self.touched[:, None].float(), old[: len(copies)], copies, is_cube[: len(copies)])
+        touched = resample(self.touched[:, None].float(), mpis, copies)
         self.touched = torch.cat([(touched[:, 0] > 0).to(torch.uint8), take_bricks(self.touched, remaining)])
         self.tiles, self.plan = number_tiles(torch.cat([fine, kept])), self.plan.with_copies()
         self.copied = torch.ones_like(self.copied)
@@ -258,10 +257,6 @@ class TexelTables(Field):
         self.touched, self.peak, self.gain = take_bricks(self.touched, kept), self.peak[kept], self.gain[kept]
         self._packed = {}
         return kept
-
-    @property
-    def _is_cube(self) -> list[bool]:
-        return [k >= len(self.plan.mpis) for k in range(self.plan.num_heads)]
 
     def _reachable(self, plan: ScenePlan) -> Bool[Tensor, "T"] | None:
         return None if self.views is None else reachable_tiles(self.views, plan, self.density.device)

@@ -111,18 +111,21 @@ def _struct(*types: type) -> type[ctypes.Structure]:
     return type("Struct", (ctypes.Structure,), {"_fields_": [(f"_{i}", t) for i, t in enumerate(types)]})
 
 
-def run_in_parts(name: str, bounds: Sequence[int], *values: Any) -> None:
-    """Calls a compiled function of ``(begin, end, *values)`` for the parts between bounds, each by a thread
-    (``cpp/parts.h``). Parts must not write to one place."""
+def call_in_parts(name: str, parts: int | Sequence[int], *values: Any, least: int = 256) -> None:
+    """Calls a compiled function of ``(begin, end, *values)`` for parts of some numbers, each by a thread
+    (``cpp/parts.h``). Parts must not write to one place.
+
+    Args:
+        name: of the function.
+        parts: bounds of the parts; of one number, even parts of 0 to that (``even_bounds``).
+        values: further arguments (``arguments``).
+        least: numbers of an even part, at least.
+    """
+    bounds = even_bounds(parts, least) if isinstance(parts, int) else parts
     function = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
     assert function is not None
     how = (ctypes.c_int64 * len(bounds))(*bounds), ctypes.c_int64(len(bounds) - 1)
     ctypes.CFUNCTYPE(None)(function)(*how, *arguments(values))
-
-
-def call_in_parts(name: str, count: int, *values: Any, least: int = 256) -> None:
-    """``run_in_parts`` for even parts of 0..count (see ``even_bounds``)."""
-    run_in_parts(name, even_bounds(count, least), *values)
 
 
 def even_bounds(count: int, least: int = 256) -> list[int]:

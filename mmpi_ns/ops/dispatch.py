@@ -9,21 +9,20 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-import os
 import subprocess
 import sysconfig
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Generic, Literal, ParamSpec, TypeVar
+from typing import Any, Generic, Literal, ParamSpec, TypeVar, cast, get_type_hints
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
-from mmpi_ns.ops.layout import SMALL, Shapes, check_shapes
+from mmpi_ns.ops.layout import SMALL, Shapes, annotated, check_shapes
 from mmpi_ns.utils.errors import InputError
 
 Route = Literal["auto", "torch", "native"]
@@ -37,7 +36,8 @@ OLDEST_TRITON = (3, 1)
 
 _PRECISIONS = (torch.float32, torch.bfloat16)
 _chosen: Route = "auto"
-_interpreting = False
+interpreting = False
+"""Whether Triton's interpreter runs the GPU kernels on CPU tensors, for tests and rehearsals; very slow."""
 _faults: dict[str, str | None] = {}
 """What is known of the compiler ("C++"), of Triton, and of each operation's GPU form: None is well, else why not."""
 _trying = threading.RLock()
@@ -109,6 +109,44 @@ def operation(*compiled: Form, check: Callable[..., None] | None = None) -> Call
     return lambda reference: Operation(reference, compiled, check)
 
 
+def in_cpp(of: Operation[..., Any], least: int | None = None) -> None:
+    """Makes ``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ the form of an operation for a CPU.
+
+    Arguments are those of the definition, a named tuple's fields one by one; sizes what the letters in their
+    annotations stand for, in the order in which they occur; results the tensor, or those of the named tuple, that it
+    returns. Tensors of another type than annotated (int64 and float32, unless it names one) take the definition.
+
+    Args:
+        of: the operation.
+        least: rows of the first result that are worth another thread; None: one thread computes all.
+    """
+    hints, forms = get_type_hints(of.reference), annotated(of.reference)
+
+    @functools.wraps(of.reference)
+    def form(*values: Any) -> Any:
+        sizes, passed = {}, []
+        for name, value in zip(of.signature.parameters, values, strict=True):
+            is_group, tensors, owner = hasattr(value, "_asdict"), {name: value}, of.reference
+            if not is_group and not isinstance(value, Tensor):
+                passed.append(hints[name](value))
+                continue
+            if is_group:
+                tensors, owner = cast(Any, value)._asdict(), type(value)
+            for part, tensor in tensors.items():
+                shape, kind = annotated(owner)[part]
+                if tensor.dtype != kind:
+                    return of.reference(*values)
+                sizes |= {letter: n for letter, n in zip(shape, tensor.shape, strict=True) if isinstance(letter, str)}
+                passed.append(tensor.contiguous())
+        columns = [forms["return"]] if "return" in forms else annotated(hints["return"]).values()
+        results = [torch.empty([sizes.get(n, n) for n in shape], dtype=kind) for shape, kind in columns]
+        parts = [0, len(results[0])] if least is None else len(results[0])
+        build.call_in_parts(f"mmpi_{of.name}", parts, *passed, *sizes.values(), *results, least=least or 1)
+        return results[0] if "return" in forms else hints["return"](*results)
+
+    of.on_cpu(form)
+
+
 @functools.cache
 def operations() -> dict[str, Operation[..., Any]]:
     """Every operation by its name."""
@@ -131,16 +169,16 @@ def form_of(name: str, *tensors: Tensor) -> Form:
     devices = {t.device.type for t in tensors}
     if _chosen == "torch" or any(t.is_floating_point() and t.dtype not in _PRECISIONS for t in tensors):
         return "reference"
-    if devices == {"cpu"} and not _interpreting:
+    if devices == {"cpu"} and not interpreting:
         return "cpu" if "cpu" in compiled and fault("C++") is None else "reference"
-    if devices == ({"cpu"} if _interpreting else {"cuda"}) and "gpu" in compiled and fault(name) is None:
+    if devices == ({"cpu"} if interpreting else {"cuda"}) and "gpu" in compiled and fault(name) is None:
         return "gpu"
     return "reference"
 
 
 def on_device(tensor: Tensor) -> bool:
-    """Whether reading a tensor synchronises: it is on a GPU, or treated as if it were (``interpret``)."""
-    return tensor.device.type != "cpu" or _interpreting
+    """Whether reading a tensor synchronises: it is on a GPU, or treated as if it were (``interpreting``)."""
+    return tensor.device.type != "cpu" or interpreting
 
 
 @functools.cache
@@ -157,7 +195,7 @@ def choose(path: Route) -> None:
     _chosen = path
     if path != "native":
         return
-    on_gpu = torch.cuda.is_available() or _interpreting
+    on_gpu = torch.cuda.is_available() or interpreting
     names = ["Triton", *(n for n, each in operations().items() if "gpu" in each.compiled)] if on_gpu else ["C++"]
     if reason := next((r for n in names if (r := fault(n)) is not None), None):
         raise InputError(
@@ -174,7 +212,7 @@ def expect(shapes: Shapes, afresh: bool = False) -> None:
     """
     global _shapes, _tries_afresh
     with _trying:
-        if afresh or (shapes != _shapes and not _interpreting):  # the interpreter would take minutes
+        if afresh or (shapes != _shapes and not interpreting):  # the interpreter would take minutes
             _shapes, _tries_afresh = shapes, afresh
             for name, each in operations().items():
                 if "gpu" in each.compiled:
@@ -192,17 +230,6 @@ def chosen(path: Route) -> Iterator[None]:
             yield
         finally:
             _chosen = before
-
-
-def interpret(on: bool) -> None:
-    """Makes Triton's interpreter run the GPU kernels on CPU tensors, for tests and rehearsals; very slow. Raises
-    ValueError if TRITON_INTERPRET=1 was not in the environment when the process started, or there is no Triton."""
-    global _interpreting
-    if on and os.environ.get("TRITON_INTERPRET") != "1":
-        raise ValueError("Triton's interpreter must be asked for before Python starts: set TRITON_INTERPRET=1.")
-    if on and (reason := fault("Triton")) is not None:
-        raise ValueError(f"Triton is not available: {reason}.")
-    _interpreting = on
 
 
 def fault(name: str) -> str | None:
@@ -235,7 +262,7 @@ def _try(name: str) -> str | None:
         return reason
     try:  # the kernels with the shapes at hand, unless they passed before on this device
         trial = importlib.import_module("mmpi_ns.ops.trial")  # which tries operations, so it comes after this one
-        record: Path | None = None if _interpreting else trial.record(name, _shapes)
+        record: Path | None = None if interpreting else trial.record(name, _shapes)
         if record is None:
             trial.run(name, "cpu", _shapes)
         elif _tries_afresh or not record.is_file():

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.layout import SceneLayout
 
-# Columns of ``head_rows``.
+# Columns of an MPI's row in ``SceneLayout.constants``.
 ORIGIN, AXES, EXTENT, STEP, END, LAST = map(tl.constexpr, (0, 3, 12, 16, 17, 18))
 SHARE, S_SCALE, U0, U_SCALE, V0, V_SCALE, INTERVAL, FLOATS = map(tl.constexpr, range(19, 27))
 # Columns of a head's layout. BRICK_OF_TILE and TILE_OF_BRICK say where in the same tensor the brick of the head's first
@@ -114,16 +114,6 @@ def bilinear(table, grids, head, plane, u, v, mask):
     c = tl.load(table + row_of(grids, head, plane, y + 1, x, mask), mask, 0.0)
     d = tl.load(table + row_of(grids, head, plane, y + 1, x + 1, mask), mask, 0.0)
     return (1 - fx) * (1 - fy) * a + fx * (1 - fy) * b + (1 - fx) * fy * c + fx * fy * d
-
-
-@triton.jit
-def is_held(grids, head, plane, u, v, mask):
-    """Whether the tables hold any of the four texels around NDC (u, v) on a plane; False where masked."""
-    x, _ = cell(u, tl.load(grids + head * INTS + WIDTH))
-    y, _ = cell(v, tl.load(grids + head * INTS + HEIGHT))
-    near = is_stored(row_of(grids, head, plane, y, x, mask)) | is_stored(row_of(grids, head, plane, y, x + 1, mask))
-    far = is_stored(row_of(grids, head, plane, y + 1, x, mask))
-    return mask & (near | far | is_stored(row_of(grids, head, plane, y + 1, x + 1, mask)))
 
 
 @triton.jit

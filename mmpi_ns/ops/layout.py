@@ -32,10 +32,6 @@ class Tables(NamedTuple):
     touched: UInt8[Tensor, "T"]
     """1 where a training ray read the row."""
 
-    def dense(self) -> list[Tensor]:
-        """The tables as compiled code reads them."""
-        return [*dense(self.density, self.reliability), *dense(self.touched, dtype=torch.uint8)]
-
 
 class Places(NamedTuple):
     """Positions of samples, in S slots of every ray."""
@@ -92,29 +88,24 @@ class SceneLayout:
         return planes + int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
 
     @cached_property
-    def head_rows(self) -> Float[Tensor, "K 26"]:
-        """Of each MPI: ``frame_rows``, 1 - near / far, scale of NDC s, lower end and scale of u and of v, interval."""
-        rows = []
+    def constants(self) -> tuple[Float[Tensor, "K 26"], Float[Tensor, "P"], Float[Tensor, "12"]]:
+        """What compiled code reads of the heads.
+
+        Of each MPI: ``frame_rows``, 1 - near / far, scale of NDC s, lower end and scale of u and of v, interval. Biases
+        of all planes of all MPIs. Lower corner of the cube, extent, step between samples, bias, interval, upper corner;
+        zeros without a cube.
+        """
+        rows, cube, cube_row, device = [], self.cube, [0.0] * 12, self.frames.origins.device
         for k, mpi in enumerate(self.mpis):
             u0, u1, v0, v1 = mpi.extent
             depth = (mpi.depth_share, 2 * mpi.near / mpi.depth_share)
             rows.append((*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), self.interval(k)))
-        numbers = torch.tensor(rows, dtype=torch.float32, device=self.frames.origins.device).reshape(len(rows), 7)
-        return torch.cat([frame_rows(self.frames), numbers], -1)
-
-    @cached_property
-    def bias_row(self) -> Float[Tensor, "P"]:
-        """Biases of all planes of all MPIs."""
-        return torch.cat(self.biases).to(self.frames.origins.device, torch.float32)
-
-    @cached_property
-    def cube_row(self) -> Float[Tensor, "12"]:
-        """Lower corner, extent, step between samples, bias, interval, upper corner; zeros without a cube."""
-        cube, numbers = self.cube, [0.0] * 12
+        numbers = torch.tensor(rows, dtype=torch.float32, device=device).reshape(len(rows), 7)
         if cube is not None:
             corner, extent = cube.lower.tolist(), (cube.upper - cube.lower).tolist()
-            numbers = [*corner, *extent, cube.step, self.cube_bias, self.cube_interval, *cube.upper.tolist()]
-        return torch.tensor(numbers, dtype=torch.float32, device=self.frames.origins.device)
+            cube_row = [*corner, *extent, cube.step, self.cube_bias, self.cube_interval, *cube.upper.tolist()]
+        biases = torch.cat(self.biases).to(device, torch.float32)
+        return torch.cat([frame_rows(self.frames), numbers], -1), biases, torch.tensor(cube_row, device=device)
 
     @cached_property
     def cpu_grids(self) -> ctypes.Array:
@@ -126,10 +117,11 @@ class SceneLayout:
     def cpu_scene(self, tables: Tables) -> ctypes.Array:
         """The layout and its tables for C++: a ``Scene`` of ``cpp/scene.h``."""
         sizes = (len(self.mpis), self.num_heads, float(self.content_near))
-        return structs((*sizes, self.head_rows, self.cpu_grids, self.bias_row, self.cube_row, *tables.dense()))
+        head_rows, biases, cube_row = self.constants
+        return structs((*sizes, head_rows, self.cpu_grids, biases, cube_row, *dense_fields(tables)))
 
     def bias_starts(self) -> list[int]:
-        """Where each head's planes begin in ``bias_row``."""
+        """Where each head's planes begin in the biases of ``constants``."""
         return [sum(len(b) for b in self.biases[:k]) for k in range(self.num_heads)]
 
     def interval(self, k: int) -> float:
@@ -160,6 +152,12 @@ def dense(*tensors: Tensor | None, dtype: torch.dtype = torch.float32) -> list[A
     """``shaped`` for tensors whose shapes ``check_shapes`` has compared; None stays so."""
     assert all(x is None or x.dtype == dtype for x in tensors), f"not all are {dtype}, which is read"
     return [x if x is None else x.contiguous() for x in tensors]
+
+
+def dense_fields(values: Any) -> list[Any]:
+    """``dense`` for the tensors of a named tuple, each of the type that it is annotated with."""
+    forms = annotated(type(values))
+    return [x for name, value in values._asdict().items() for x in dense(value, dtype=forms[name][1])]
 
 
 class Shapes(NamedTuple):
@@ -213,7 +211,7 @@ def check_shapes(owner: Callable[..., Any], values: Mapping[str, Any], sizes: di
         letters |= {} if isinstance(value, Tensor) else getattr(value, "sizes", {})
     for name, value in values.items():
         if isinstance(value, Tensor):
-            form = _annotated(owner).get(name)
+            form, _ = annotated(owner).get(name, (None, None))
             if form is None:
                 continue
             expected = [letters.setdefault(x, n) if isinstance(x, str) else x for x, n in zip(form, value.shape)]  # noqa: B905
@@ -228,11 +226,15 @@ def check_shapes(owner: Callable[..., Any], values: Mapping[str, Any], sizes: di
 
 
 @functools.cache
-def _annotated(owner: Callable[..., Any]) -> dict[str, tuple[str | int, ...]]:
-    """Sizes of the tensors of an owner by name; those of any shape are left out."""
+def annotated(owner: Callable[..., Any]) -> dict[str, tuple[tuple[str | int, ...], torch.dtype]]:
+    """Sizes of the tensors of an owner by name, and the type that compiled code reads; those of any shape are left
+    out."""
     forms = {}
     for name, hint in get_type_hints(owner).items():
-        texts = [t for part in (hint, *get_args(hint)) if isinstance(t := getattr(part, "dim_str", None), str)]
-        if texts and "..." not in texts[0]:
-            forms[name] = tuple(int(x) if x.isdigit() else x for x in texts[0].split())
+        arrays = [part for part in (hint, *get_args(hint)) if isinstance(getattr(part, "dim_str", None), str)]
+        if arrays and "..." not in arrays[0].dim_str:
+            # Of a kind of numbers the usual type, else the only one.
+            kind = next((x for x in ("float32", "int64") if x in arrays[0].dtypes), arrays[0].dtypes[0])
+            sizes = tuple(int(x) if x.isdigit() else x for x in arrays[0].dim_str.split())
+            forms[name] = sizes, getattr(torch, kind)
     return forms

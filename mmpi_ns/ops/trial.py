@@ -108,8 +108,7 @@ def _scene(device: str, with_cube: bool, count: int = 2) -> tuple[SceneLayout, T
     if with_cube:
         plan = CubePlan((-1.1, -0.9, 1.9), (0.95, 1.05, 4.3), (4, 5, 6))
         sizes, cube = [*sizes, plan.shape], Cube.pack(plan, 1.0, device=device)
-    tiles = torch.arange(1, make_grids(sizes)[0].tiles.numel() + 1, dtype=torch.int32)
-    grids = make_grids(sizes, tiles.to(device))
+    grids = make_grids(sizes, make_grids(sizes)[0].tiles.to(device), with_cube)
     frames, rows = Frames.pack(mpis, device=device), len(grids[0].places) * BRICK
     biases = [torch.full((m.planes,), -5.0, device=device) for m in mpis]
     layout = SceneLayout(mpis, frames, grids, biases, min(1.0, 2 / count), cube, -5.0, 1.0, 0.7)  # not opaque
@@ -149,11 +148,6 @@ def _entries(device: str, *shape: int) -> Tensor:
     return (_random(device, *shape) * (ROWS // 3)).long() * 3
 
 
-def _texel_rows(device: str, shapes: Shapes) -> list[tuple]:
-    heads = (torch.arange(RAYS, device=device) * 2) // RAYS
-    return [(_scene(device, shapes.cube)[0], heads, heads + 2, 2 * _random(device, RAYS, 3) - 1)]
-
-
 def _composites(device: str, shapes: Shapes) -> list[tuple]:
     """Rays of every width, at whose ends some light is left, thin samples and opaque ones among theirs."""
     return [
@@ -174,7 +168,7 @@ def _variations(device: str, shapes: Shapes) -> list[tuple]:
         rows = torch.cat([grid.rows for grid in layout.grids])[::3]
         for channels in (1, shapes.channels):
             table = 3 * _random(device, len(layout.grids[0].places) * BRICK, channels)
-            scales = [(0.5, 2.0, 1.0)] * layout.num_heads
+            scales = torch.tensor([(0.5, 2.0, 1.0)] * layout.num_heads, device=device)
             cases.append((table[rows].requires_grad_(), table, rows, layout, scales))
     return cases
 
@@ -211,7 +205,10 @@ def _pictures(device: str, shapes: Shapes, many: bool | None = None) -> list[tup
 
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "march": _marches,
-    "texel_rows": _texel_rows,
+    "texel_rows": lambda device, shapes: [
+        (_scene(device, shapes.cube)[0], heads, heads + 2, 2 * _random(device, RAYS, 3) - 1)
+        for heads in [torch.arange(RAYS, device=device) * 2 // RAYS]
+    ],
     "weighted_rows": lambda device, shapes: [
         (_random(device, ROWS, channels), _entries(device, RAYS, taps), _random(device, RAYS, taps))
         for taps in (4, 8)

@@ -51,10 +51,6 @@ class Candidate:
     texel: NDArray[np.float32]
     """[Q] e_t of each observation, relative to the pixels of a texel; inf if the candidate does not contain it."""
 
-    def coarsest(self, max_voxels: int) -> float:
-        """Minimum pixels that a texel spans: a cube may not have enough voxels for finer ones."""
-        return self.rows / max_voxels if isinstance(self.frame, CubePlan) else 0.0
-
     def at(self, texel_pixels: float, planes: int, max_voxels: int) -> MPIPlan | CubePlan:
         """The MPI or cube with texels of this many pixels."""
         if isinstance(self.frame, CubePlan):

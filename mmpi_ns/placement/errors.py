@@ -95,19 +95,16 @@ def pixel_slopes(
     seen = inside & (depth > 1e-9 * np.abs(q).max(-1))
     depth = np.where(seen, depth, 1.0)
 
-    wide = observations.wide[cameras]
-
-    def slope(direction: Array) -> Array:
-        """Length in pixels of a unit step along one of (u, v, w)."""
+    wide, slopes = observations.wide[cameras], []
+    for direction in (shift, columns[..., 0], columns[..., 1]):  # of a unit step in disparity, u and v
         moved = direction[:, :2] / depth[:, None] + q[:, :2] * (direction[:, 2] / depth**2)[:, None]
         pixels = np.where(seen, np.linalg.norm(moved * focal, axis=-1), np.inf)
         if wide.any():  # such lenses have about as many pixels for each degree at the borders as in the middle
             some, size = direction[wide], np.linalg.norm(q[wide], axis=-1)
             turned = np.linalg.norm(np.cross(some, q[wide]), axis=-1) / np.maximum(size, 1e-12) ** 2
             pixels[wide] = np.where(inside[wide], turned * focal[wide].mean(-1), np.inf)
-        return pixels
-
-    return slope(shift), slope(columns[..., 0]), slope(columns[..., 1])
+        slopes.append(pixels)
+    return slopes[0], slopes[1], slopes[2]
 
 
 def cube_errors(cube: CubePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> Array:

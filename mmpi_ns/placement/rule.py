@@ -202,7 +202,8 @@ class _Choice:
         # Of each observation if a candidate serves it: log2 of the expected pixel error over ``enough``.
         enough, cost = config.enough * texel_pixels, []
         for c in candidates:
-            size = max(texel_pixels, c.coarsest(config.max_voxels))
+            # A cube may not have enough voxels for texels as fine.
+            size = max(texel_pixels, c.rows / config.max_voxels) if isinstance(c.frame, CubePlan) else texel_pixels
             error = np.hypot(c.plane / (config.max_planes - 1), 0.5 * size * c.texel)
             cost.append(np.log2(np.clip(error, enough, max(WORST, 2 * enough)) / enough).astype(np.float32))
         self.cost: NDArray[np.float32] = np.stack(cost)

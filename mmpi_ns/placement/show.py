@@ -37,11 +37,8 @@ class PlanReport:
     overlap: float
     """Heads that hold an observation, on average."""
     errors: PixelErrors
-
-    @property
-    def served_errors(self) -> Array:
-        """[Q] expected pixel error of each observation in the head that serves it best; ``WORST`` where none does."""
-        return np.minimum(self.errors.combined.min(-1), WORST)
+    served_errors: Array
+    """[Q] expected pixel error of each observation in the head that serves it best; ``WORST`` where none does."""
 
 
 def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints) -> PlanReport:
@@ -57,7 +54,7 @@ def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints)
             figures[1:, k] = np.median(combined[served, k]), np.median(rest)
     shares, error_with, error_without = figures
     unserved, overlap = float(weights[~held.any(-1)].sum()), float(held.sum(-1) @ weights)
-    return PlanReport(shares, error_with, error_without, unserved, overlap, errors)
+    return PlanReport(shares, error_with, error_without, unserved, overlap, errors, combined.min(-1))
 
 
 def table(plan: ScenePlan, observations: Observations, report: PlanReport) -> str:

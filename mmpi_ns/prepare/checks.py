@@ -197,23 +197,18 @@ def write_report(
     }
     by_badness = sorted(findings, key=lambda f: (f.kind, -f.badness))
     warnings = [*warnings, *(f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}" for f in by_badness)]
+    cameras = ((c, ", ".join(f"{v:.5g}" for v in c.params)) for _, c in sorted(model.cameras.items()))
     parts = [
-        f"# {title}\n",
-        "\n".join(["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]),
-        "\n## Warnings\n",
-        "\n".join(f"- {w}" for w in warnings) or "None.",
+        f"# {title}\n\n| | |\n|---|---|",
+        *(f"| {k} | {v} |" for k, v in rows.items()),
+        "\n## Warnings\n\n" + ("\n".join(f"- {w}" for w in warnings) or "None."),
         "\n## Track from above\n\n![track](report/track.png)\n",
         *(["## What moves\n\n![masks](report/moving.jpg)\n"] if (scene / "report/moving.jpg").is_file() else []),
         "## Cameras\n",
-        *(
-            f"- {c.model.name} {c.width}x{c.height}: {c.params_info} = {', '.join(f'{v:.5g}' for v in c.params)}"
-            for _, c in sorted(model.cameras.items())
-        ),
-        "\n## Coverage\n",
-        "Share of an image's cells (8 x 6) that hold a keypoint with a point; the least:\n",
+        *(f"- {c.model.name} {c.width}x{c.height}: {c.params_info} = {params}" for c, params in cameras),
+        "\n## Coverage\n\nShare of an image's cells (8 x 6) that hold a keypoint with a point; the least:\n",
         *(f"- {n}: {v:.0%}" for n, v in sorted(covered.items(), key=lambda x: x[1])[:WORST]),
-        "\n## Notes\n",
-        f"- {note}",
+        f"\n## Notes\n\n- {note}",
     ]
     write_text(scene / "report.md", "\n".join(parts) + "\n")
     _draw_track(model, findings, scene / "report" / "track.png")

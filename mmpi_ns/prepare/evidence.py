@@ -227,15 +227,14 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
     wide = np.cos(np.radians(LEAST_ANGLE))
     before, after = (rays[first[last]], rays[last]), (rays[last + 1], rays[stop[last] - 1])
     last = last[((before[0] * before[1]).sum(-1) < wide) & ((after[0] * after[1]).sum(-1) < wide)]
-
-    def distance(start: Places, end: Places) -> Array:
+    distances = []  # of the points from the last frame before the gap, by the frames before it and by those after it
+    for start, end in ((first[last], last + 1), (last + 1, stop[last])):
         terms = sums[end] - sums[start]
         at = np.linalg.solve(terms[:, :, :3], terms[:, :, 3:])[..., 0]
-        return ((at - centers[last]) * rays[last]).sum(-1)
-
-    pair = distance(first[last], last + 1), distance(last + 1, stop[last])
-    seen = (pair[0] > 0) & (pair[1] > 0)
-    change, left, right = np.log(pair[1][seen] / pair[0][seen]), frames[last[seen]], frames[last[seen] + 1]
+        distances.append(((at - centers[last]) * rays[last]).sum(-1))
+    near, far = distances
+    seen = (near > 0) & (far > 0)
+    change, left, right = np.log(far[seen] / near[seen]), frames[last[seen]], frames[last[seen] + 1]
     result = np.full(max(count - 1, 0), np.nan)
     for gap in range(len(result)):
         across_gap = change[(left <= gap) & (right > gap)]

@@ -12,8 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from rich.progress import track
 
-from mmpi_ns.capture.moving import find_moving, in_image
-from mmpi_ns.capture.moving_picture import draw_moving
+from mmpi_ns.capture.moving import draw_moving, find_moving, in_image
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import straightened_color
 from mmpi_ns.prepare.images import Photo, read_intrinsics

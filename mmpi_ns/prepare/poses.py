@@ -19,6 +19,8 @@ from mmpi_ns.utils.errors import InputError, say
 MAX_LAG = 0.05
 """Maximum time in seconds between an image and its pose."""
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+KIND = re.compile(r"[._-]?(pose|color|rgb|image)s?$", re.IGNORECASE)
+"""End of a name that differs between images and poses: frame-000001.color.png, frame-000001.pose.txt."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +131,8 @@ def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """4x4 matrices: one text file for each image, by name, else in order."""
     files = [p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")]
     files.sort(key=lambda p: natural_key(p.name))
-    by_stem = {_pose_stem(p): p for p in files if p.is_file()}
-    chosen = {p.name: by_stem[stem] for p in photos if (stem := _pose_stem(Path(p.source))) in by_stem}
+    by_stem = {KIND.sub("", p.stem): p for p in files if p.is_file()}
+    chosen = {p.name: by_stem[stem] for p in photos if (stem := KIND.sub("", Path(p.source).stem)) in by_stem}
     says = "4x4 matrices, by name"
     if len(chosen) < 2:
         if len(files) != len(photos):
@@ -147,11 +149,6 @@ def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
             raise InputError(f"{file} is {matrix.shape}, not 4x4.")
         poses[name] = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
     return KnownPoses(poses, says)
-
-
-def _pose_stem(path: Path) -> str:
-    """Name without the part that differs between images and poses: frame-000001.color.png, frame-000001.pose.txt."""
-    return re.sub(r"[._-]?(pose|color|rgb|image)s?$", "", path.stem, flags=re.IGNORECASE)
 
 
 def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:

@@ -168,11 +168,7 @@ def why_not_baked(model_field: MMPIField) -> str:
 
 @torch.no_grad()
 def bake(
-    model_field: MMPIField,
-    threshold: float,
-    background: float,
-    blends: bool = False,
-    exposure: tuple[float, ...] = (1.0, 1.0, 1.0),
+    model_field: MMPIField, threshold: float, background: float, blends: bool, exposure: tuple[float, ...]
 ) -> BakedWindow:
     """A field as bricks of 8-bit codes: all that are not empty.
 
@@ -204,28 +200,20 @@ def bake(
         for part in reached[k].nonzero().split(AT_ONCE_BRICKS):  # what shows nothing is left out
             codes = density_codes.encode(_raw(model_field, k, part, shares))
             reached[k][tuple(part.T)] = codes.amax((-1, -2)) > 0
-        columns_here, places = columns_from(reached[k], count)
-        columns.append(columns_here)
-        count += len(places)
+        stored, places = columns_from(reached[k], count)
+        columns, count = [*columns, stored], count + len(places)
         for part in places.split(AT_ONCE_BRICKS):
             density.append(density_codes.encode(_raw(model_field, k, part, shares)))
             rows, exists = _rows(model_field.grids[k], part)
             codes = torch.stack([c.encode(features[rows, i]) for i, c in enumerate(channels)], -1)
             texels.append((codes * exists[..., None]).cpu())
-    mpis = BakedMpis(
-        plan.mpis,
-        tuple(model_field.layout.interval(k) for k in heads),
-        torch.cat(columns),
-        torch.cat(density).contiguous(),
-        torch.cat(texels).contiguous(),
-        density_codes,
-        channels,
-    )
-    farthest = 10 * max(m.farthest for m in plan.mpis)
+    tables = torch.cat(columns), torch.cat(density).contiguous(), torch.cat(texels).contiguous()
+    intervals = tuple(model_field.layout.interval(k) for k in heads)
+    mpis = BakedMpis(plan.mpis, intervals, *tables, density_codes, channels)
     numbers = [x.detach().cpu() for x in network.layers(0)]
     numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
-    layers = tuple(zip(numbers[::2], numbers[1::2], strict=True))
-    shader = Shader(layers, network.direction_frequencies, MOST_CHANGE)
+    shader = Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.direction_frequencies, MOST_CHANGE)
+    farthest = 10 * max(m.farthest for m in plan.mpis)
     return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
 
 

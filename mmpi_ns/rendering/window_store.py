@@ -17,7 +17,7 @@ from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import to_text, write_atomically
-from mmpi_ns.utils.host import Uninterrupted
+from mmpi_ns.utils.host import uninterrupted
 
 _DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
 """Exceptions of reading a damaged file."""
@@ -48,12 +48,12 @@ class WindowStore:
     @property
     def in_memory(self) -> tuple[int, ...]:
         """Windows that can be rendered without reading a file, the most recently used last."""
-        with Uninterrupted(), self._lock:
+        with uninterrupted(), self._lock:
             return tuple(self._held)
 
     def forget(self, window: int) -> None:
         """Ignores the file from now on: the window is about to be trained and will be written again."""
-        with Uninterrupted(), self._lock:
+        with uninterrupted(), self._lock:
             self._held.pop(window, None)
             self._alive.pop(window, None)
 
@@ -77,7 +77,7 @@ class WindowStore:
         Raises:
             InputError: the file is missing or damaged (says which, and what to do).
         """
-        with Uninterrupted(), self._lock:
+        with uninterrupted(), self._lock:
             field = self._alive.get(window)
             if field is None:
                 field = self._read(window).to(device).eval()

@@ -51,7 +51,6 @@ def take_bricks(table: Float[Tensor, "N C"], kept: Int[Tensor, "K"]) -> Float[Te
 def grown_tiles(
     old: list[TexelGrid],
     new: list[TexelGrid],
-    is_cube: list[bool],
     reachable: Bool[Tensor, "T"] | None,
     least: float = 0.0,
 ) -> Int[Tensor, "T"]:
@@ -60,14 +59,13 @@ def grown_tiles(
     Args:
         old: current heads.
         new: heads at the new resolution; their tiles are not read.
-        is_cube: which of them is the cube.
         reachable: tiles that training rays cross; None for all.
         least: share of stored texels in an interpolated one from which (0: above which) it is stored.
     """
     stored = torch.zeros_like(new[0].tiles, dtype=torch.bool)
-    for source, target, cube in zip(old, new, is_cube, strict=True):
-        for sources, planes in _chunks(target, cube):
-            share = _resize(stored_texels(source, sources).float(), target, cube)[..., 0]
+    for source, target in zip(old, new, strict=True):
+        for sources, planes in _chunks(target):
+            share = _resize(stored_texels(source, sources).float(), target)[..., 0]
             there = share >= least if least else share > 0
             reached = pad(there.float(), (0, -target.width % SIDE, 0, -target.height % SIDE))
             tiles = max_pool2d(reached[:, None], SIDE)[:, 0] > 0
@@ -105,7 +103,7 @@ def tiles_with_copies(
 
 
 def resample(
-    table: Float[Tensor, "N C"], old: list[TexelGrid], new: list[TexelGrid], is_cube: list[bool], empty: float = 0.0
+    table: Float[Tensor, "N C"], old: list[TexelGrid], new: list[TexelGrid], empty: float = 0.0
 ) -> Float[Tensor, "M C"]:
     """The table at another resolution: bilinear on every plane of an MPI, trilinear in the cube (paper growth).
 
@@ -115,27 +113,27 @@ def resample(
     if not empty and not bool(table.any()):  # untrained reliability takes no memory
         return lazy_zeros((int((new[0].tiles > 0).sum() + 1) * BRICK, table.shape[-1]), table.dtype, table.device)
     out = new_table(new[0].tiles, table.shape[-1], empty, table.dtype)
-    for source, target, cube in zip(old, new, is_cube, strict=True):
-        for sources, planes in _chunks(target, cube):
+    for source, target in zip(old, new, strict=True):
+        for sources, planes in _chunks(target):
             if not bool(target.own_tiles[planes].any()):
                 continue
             images = read_planes(table, source, sources)
             stored = stored_texels(source, sources).to(table.dtype)
             if bool(stored.all()):
-                write_planes(out, target, planes, _resize(images, target, cube))
+                write_planes(out, target, planes, _resize(images, target))
                 continue
-            there, value = _resize(stored, target, cube), _resize(images * stored, target, cube)
+            there, value = _resize(stored, target), _resize(images * stored, target)
             value = torch.where(there > 1 - 1e-6, value, value / there.clamp(min=1e-12))
             write_planes(out, target, planes, torch.where(there > 0, value, empty))
     return out
 
 
-def _chunks(target: TexelGrid, is_cube: bool) -> Iterator[tuple[slice, slice]]:
+def _chunks(target: TexelGrid) -> Iterator[tuple[slice, slice]]:
     """A few planes at a time: where they come from and where they go. The cube's layers go together."""
-    step = target.depth if is_cube else max(1, CHUNK // (target.height * target.width))
+    step = target.depth if target.is_cube else max(1, CHUNK // (target.height * target.width))
     for start in range(0, target.depth, step):
         planes = slice(start, min(start + step, target.depth))
-        yield (slice(None) if is_cube else planes), planes
+        yield (slice(None) if target.is_cube else planes), planes
 
 
 def stored_texels(grid: TexelGrid, planes: slice) -> Bool[Tensor, "P h w 1"]:
@@ -144,9 +142,9 @@ def stored_texels(grid: TexelGrid, planes: slice) -> Bool[Tensor, "P h w 1"]:
     return wide[:, : grid.height, : grid.width, None]
 
 
-def _resize(images: Float[Tensor, "P h w C"], target: TexelGrid, is_cube: bool) -> Float[Tensor, "Q H W C"]:
+def _resize(images: Float[Tensor, "P h w C"], target: TexelGrid) -> Float[Tensor, "Q H W C"]:
     """Images of another size, corners on corners; the layers of a cube are resized as well."""
-    if is_cube:
+    if target.is_cube:
         size = (target.depth, target.height, target.width)
         out = interpolate(images.permute(3, 0, 1, 2)[None], size=size, mode="trilinear", align_corners=True)
         return out[0].permute(1, 2, 3, 0)

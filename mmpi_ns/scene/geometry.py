@@ -30,26 +30,22 @@ class Frames:
     num_planes: Int[Tensor, "K"]
     last_disparities: Float[Tensor, "K"]
     """Disparity of the last plane, 1 / far; 0 if an MPI reaches to infinity."""
+    depth_shares: Float[Tensor, "K"]
+    """1 - near / far: the fraction of all disparities beyond the near plane that an MPI spans; 1 to infinity."""
+    disparity_steps: Float[Tensor, "K"]
+    """Disparity between neighbouring planes, (1/near - 1/far) / (L - 1), in 1 / scene units."""
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
-        def column(name: str, *shape: int) -> Tensor:
-            values = torch.tensor([getattr(m, name) for m in mpis], dtype=dtype, device=device)
-            return values.reshape(len(mpis), *shape)
-
-        parts = column("origin", 3), column("axes", 3, 3), column("near"), column("extent", 4)
+        shapes = {"origin": (3,), "axes": (3, 3), "near": (), "extent": (4,), "last_disparity": ()}
+        origins, axes, nears, extents, ends = (
+            torch.tensor([getattr(m, name) for m in mpis], dtype=dtype, device=device).reshape(len(mpis), *shape)
+            for name, shape in shapes.items()
+        )
         planes = torch.tensor([m.planes for m in mpis], dtype=torch.int64, device=device)
-        return Frames(*parts, num_planes=planes, last_disparities=column("last_disparity"))
-
-    @property
-    def disparity_steps(self) -> Float[Tensor, "K"]:
-        """Disparity between neighbouring planes, (1/near - 1/far) / (L - 1), in 1 / scene units."""
-        return self.depth_shares / (self.nears * (self.num_planes - 1).to(self.nears.dtype))
-
-    @property
-    def depth_shares(self) -> Float[Tensor, "K"]:
-        """1 - near / far: the fraction of all disparities beyond the near plane that an MPI spans; 1 to infinity."""
-        return 1.0 - self.nears * self.last_disparities
+        shares = 1.0 - nears * ends
+        steps = shares / (nears * (planes - 1).to(dtype))
+        return Frames(origins, axes, nears, extents, planes, ends, shares, steps)
 
     def one(self, k: int) -> Frames:
         """Frame k alone."""

@@ -32,20 +32,17 @@ class TexelGrid:
     depth: int
     height: int
     width: int
+    down: int
+    """Rows of tiles of a plane,"""
+    across: int
+    """and tiles in a row."""
+    is_cube: bool
     first_tile: int
     """Index of the head's first tile among those of all heads."""
     tiles: Int[Tensor, "T"]
     """Brick of every tile of all heads (int32); 0 for empty tiles."""
     places: Int[Tensor, "B"]
     """Tile of every brick (int64); -1 for the empty one."""
-
-    @property
-    def down(self) -> int:
-        return -(-self.height // SIDE)
-
-    @property
-    def across(self) -> int:
-        return -(-self.width // SIDE)
 
     @property
     def own_tiles(self) -> Int[Tensor, "D Y X"]:
@@ -131,7 +128,7 @@ def head_grids(plan: ScenePlan, tiles: Int[Tensor, "T"] | None = None) -> list[T
         plan: sizes of the heads.
         tiles: brick of every tile; None stores all of them in order.
     """
-    return make_grids(head_shapes(plan), tiles)
+    return make_grids(head_shapes(plan), tiles, plan.cube is not None)
 
 
 def head_shapes(plan: ScenePlan) -> list[tuple[int, int, int]]:
@@ -139,16 +136,22 @@ def head_shapes(plan: ScenePlan) -> list[tuple[int, int, int]]:
     return [(m.planes, m.height, m.width) for m in plan.mpis] + ([plan.cube.shape] if plan.cube is not None else [])
 
 
-def make_grids(shapes: list[tuple[int, int, int]], tiles: Int[Tensor, "T"] | None = None) -> list[TexelGrid]:
-    """Grids of the given sizes, stored one after the other."""
-    counts = [depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in shapes]
+def make_grids(
+    shapes: list[tuple[int, int, int]], tiles: Int[Tensor, "T"] | None = None, with_cube: bool = False
+) -> list[TexelGrid]:
+    """Grids of these sizes, stored one after the other; ``with_cube``: the last one is the cube."""
+    sides = [(-(-height // SIDE), -(-width // SIDE)) for _, height, width in shapes]
+    counts = [depth * math.prod(side) for (depth, _, _), side in zip(shapes, sides, strict=True)]
     if tiles is None:
         tiles = torch.arange(1, sum(counts) + 1, dtype=torch.int32)
     assert len(tiles) == sum(counts), (len(tiles), shapes)
     stored = tiles.nonzero()[:, 0]
     places = torch.full((len(stored) + 1,), -1, dtype=torch.int64, device=tiles.device)
     places[tiles[stored].to(torch.int64)] = stored
-    return [TexelGrid(*s, sum(counts[:k]), tiles, places) for k, s in enumerate(shapes)]
+    return [
+        TexelGrid(*shape, *side, with_cube and k == len(shapes) - 1, sum(counts[:k]), tiles, places)
+        for k, (shape, side) in enumerate(zip(shapes, sides, strict=True))
+    ]
 
 
 def number_tiles(stored: Bool[Tensor, "T"]) -> Int[Tensor, "T"]:

@@ -57,11 +57,6 @@ class TrainingViews:
         bounded = projects[:, 0].expand(count) & (ahead > 0.01).all(1)
         return TrainingViews(poses[:, :, 3], torch.where(bounded[:, None, None], inward, 0.0))
 
-    def some(self, chosen: NDArray[np.int64]) -> TrainingViews:
-        """Those of the chosen images."""
-        index = torch.from_numpy(chosen)
-        return TrainingViews(self.origins[index], self.inward[index])
-
 
 def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.device = "cpu") -> Bool[Tensor, "T"]:
     """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read.

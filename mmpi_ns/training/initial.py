@@ -6,6 +6,8 @@ that all learn. A ray of known depth says where its surface is, and that the pla
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -29,21 +31,15 @@ DARKEST = 0.02
 """Colours start between this and its complement, so that their logits can still move."""
 
 
-class Votes:
-    """What rays of known depth say of each row of the tables.
+class Votes(NamedTuple):
+    """What rays of known depth say of each of the T rows of the tables."""
 
-    Args:
-        rows: T, rows of the tables.
-        device: of the votes.
-    """
-
-    def __init__(self, rows: int, device: torch.device | str) -> None:
-        self.surface: Float[Tensor, "T"] = torch.zeros(rows, device=device)
-        """Votes for a surface: of one ray, all planes within the error of its depth together have about one."""
-        self.empty: Float[Tensor, "T"] = torch.zeros(rows, device=device)
-        """Rays that pass and reach their surface behind."""
-        self.colors: Float[Tensor, "T 3"] = torch.zeros(rows, 3, device=device)
-        """Colours of the votes for a surface, summed."""
+    surface: Float[Tensor, "T"]
+    """Votes for a surface: of one ray, all planes within the error of its depth together have about one."""
+    empty: Float[Tensor, "T"]
+    """Rays that pass and reach their surface behind."""
+    colors: Float[Tensor, "T 3"]
+    """Colours of the votes for a surface, summed."""
 
     def add(
         self,
@@ -122,12 +118,13 @@ def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:
         sources: of its rays.
         seed: of the run.
     """
-    votes = Votes(len(field.density), field.density.device)
+    sizes = len(field.density), len(field.density), (len(field.density), 3)
+    votes = Votes(*(torch.zeros(size, device=field.density.device) for size in sizes))
     for i in range(BATCHES):
         rays, batch = sources.draw(BATCH, generator(seed, i, "initial", field.density.device))
         count = len(batch["image"])
         depths = rays.metadata[PIXEL_DEPTH][:count]
-        known = (depths[:, 0] > 0).nonzero()[:, 0]
-        parts = rays.origins[known], rays.directions[known], depths[known], batch["image"][known, :3]
+        measured = (depths[:, 0] > 0).nonzero()[:, 0]
+        parts = rays.origins[measured], rays.directions[measured], depths[measured], batch["image"][measured, :3]
         votes.add(field.layout, *parts, field.plan.ray_near)
     start_from_votes(field, votes)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.optim import Optimizer
@@ -18,22 +19,16 @@ class PhaseSchedulerConfig(SchedulerConfig):
     _target: type = field(default_factory=lambda: PhaseScheduler)
     kind: str = "density"
     """Parameter kind of the group."""
+    progress: ClassVar[Progress | None] = None
+    """Not an option: the trainer gives it to its copy of the config. Rates are those of its schedule, also if a
+    checkpoint replaces that, and constant without it (a config used outside this trainer)."""
 
 
 class PhaseScheduler(Scheduler):
-    """Rates of the schedule of ``progress``, also if a checkpoint replaces it; constant rates without ``progress`` (a
-    config used outside this trainer)."""
+    """Rates of the schedule that a run follows."""
 
     config: PhaseSchedulerConfig
-    progress: Progress | None = None
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        kind, progress = self.config.kind, self.progress
+        kind, progress = self.config.kind, self.config.progress
         return LambdaLR(optimizer, lambda step: progress.schedule.rate_factor(kind, step) if progress else 1.0)
-
-    @classmethod
-    def following(cls, config: SchedulerConfig, progress: Progress) -> SchedulerConfig:
-        """The config of a scheduler that follows a run; other schedulers are unchanged."""
-        if not isinstance(config, PhaseSchedulerConfig):
-            return config
-        return replace(config, _target=type("Following", (cls,), {"progress": progress}))

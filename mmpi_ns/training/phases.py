@@ -130,16 +130,12 @@ class Schedule:
         """Whether bricks are released before this step."""
         return self._local(step) in self.release
 
-    def refines_at(self, step: int) -> bool:
+    def refines_at(self, step: int, copies: bool = False) -> bool:
         """Whether texels may become finer than planned before this step: at releases after the last growth, as long as
-        rates are high."""
-        high = self._sharp_from < self._local(step) <= self.decay_from * self.phases[0].end
-        return high and self.releases_at(step)
-
-    def copies_at(self, step: int) -> bool:
-        """Whether MPIs may get finer copies before this step: where texels may become finer, but not before all of them
-        had time to."""
-        return self.refines_at(step) and self._local(step) > COPIES_FROM * self.decay_from * self.phases[0].end
+        rates are high. ``copies``: whether MPIs may get finer copies, which wait until all texels had time to."""
+        high = self.decay_from * self.phases[0].end
+        is_high = max(self._sharp_from, COPIES_FROM * high if copies else 0) < self._local(step) <= high
+        return is_high and self.releases_at(step)
 
     def watches(self, step: int) -> bool:
         """Whether the samples of a step count for the next release of bricks."""

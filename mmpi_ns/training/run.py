@@ -109,7 +109,10 @@ class Progress(nn.Module):
 
 def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:
     """Training images whose rays the window renders."""
-    return None if views is None else views.some(cameras_of(window, views.origins.numpy()))
+    if views is None:
+        return None
+    chosen = torch.from_numpy(cameras_of(window, views.origins.numpy()))
+    return TrainingViews(views.origins[chosen], views.inward[chosen])
 
 
 @dataclass(eq=False)
@@ -165,7 +168,7 @@ class TrainingRun:
             progress.window = window
             for kind, params in groups.items():
                 if kind in optimizers:
-                    optimizers[kind].reset_moments(params[0])
+                    optimizers[kind].state.pop(params[0], None)
         prepare_storage(field, schedule, step, self.release_weight, optimizers)
         if attributes is not None and attributes.pipeline is not None:
             manager = attributes.pipeline.datamanager

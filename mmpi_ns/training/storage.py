@@ -45,10 +45,10 @@ def prepare_storage(
     grows = factor > field.factor
     if grows:
         for optimizer, table in trained:
-            optimizer.reset_moments(table)
+            optimizer.state.pop(table, None)
     if grows or schedule.releases_at(step):
         give_back_freed_memory()
-    gain = field.gain if schedule.copies_at(step) else None
+    gain = field.gain if schedule.refines_at(step, copies=True) else None
     if schedule.releases_at(step):
         remaining.append(field.release_unused(FORMING * least if grows else least))
     if grows:  # what has just been released does not grow
@@ -91,7 +91,7 @@ def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any,
         tiles = field.tiles_at(factor)
         if bytes_of(tiles) <= budget:
             for optimizer, table in trained:
-                optimizer.reset_moments(table)
+                optimizer.state.pop(table, None)
             give_back_freed_memory()
             field.grow(factor, tiles)
             give_back_freed_memory()
@@ -138,7 +138,7 @@ def copy_finely(
     if not count or not float(gain.sum()) > 0:
         return
     for optimizer, table in trained:
-        optimizer.reset_moments(table)
+        optimizer.state.pop(table, None)
     tiles = chosen(count)
     share = float(gain[field.tiles[tiles].to(torch.int64)].sum() / gain.sum())
     stored = int(tiles.sum()) / field.num_bricks

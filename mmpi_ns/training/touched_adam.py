@@ -58,10 +58,6 @@ class TouchedAdam(torch.optim.Optimizer):
                     for tensor, new in zip(old, adam(*old, param.grad, constants), strict=True):
                         tensor.copy_(new)
 
-    def reset_moments(self, param: Parameter) -> None:
-        """Forgets the moments of a parameter whose data was resized or redefined."""
-        self.state.pop(param, None)
-
     def keep_blocks(self, param: Parameter, kept: Tensor, size: int) -> None:
         """Keeps the moments of the blocks ``kept`` [K] of a table, of ``size`` rows each, in that order."""
         state = self.state.get(param, {})

@@ -34,7 +34,7 @@ from mmpi_ns.training.checkpoints import (
     read_checkpoint,
     write_plan,
 )
-from mmpi_ns.training.learning_rates import PhaseScheduler
+from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.options import check_device, check_nothing_left, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
@@ -212,9 +212,11 @@ class MMPITrainer(Trainer):
         # nerfstudio shows what is left
         self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps
         config: dict[str, Any] = {
-            name: entry | {"scheduler": PhaseScheduler.following(entry["scheduler"], progress)}
-            for name, entry in self.config.optimizers.items()
+            name: entry | {"scheduler": copy.copy(entry["scheduler"])} for name, entry in self.config.optimizers.items()
         }
+        for entry in config.values():
+            if isinstance(entry["scheduler"], PhaseSchedulerConfig):
+                vars(entry["scheduler"])["progress"] = progress
         return Optimizers(config, self.pipeline.get_param_groups())
 
     # Steps --------------------------------------------------------------------------------------------------------

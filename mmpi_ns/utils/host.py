@@ -1,7 +1,7 @@
 """Everything that this package changes in its host (nerfstudio, Python, glibc), with the reason and the undo of each.
 
 Nothing happens at import, nor in a program that makes a model, a pipeline or a trainer itself. ``PATCHES`` last for a
-process and are made in nerfstudio's commands and ours alone (``enter_command``); ``undo`` takes them back. What is
+process and are made in nerfstudio's commands and ours alone (``enter_command``); leaving one takes it back. What is
 changed for a block is a context manager below. No other module of the method assigns to what it imports
 (``tests/utils/test_host.py``).
 """
@@ -94,15 +94,24 @@ def _hide_notices() -> Iterator[None]:
 
 
 @contextmanager
-def _keep_freed_memory() -> Iterator[None]:
-    """glibc's malloc: a training step takes again what the last one freed; see ``malloc_keeps``."""
-    malloc_keeps(KEPT, OWN_MAPPING)
+def keep_freed_memory() -> Iterator[None]:
+    """glibc's malloc: a training step takes again what the last one freed. Its defaults give much of it back to the
+    system, which then hands out zeroed pages: thousands of page faults a step. glibc adapts its defaults and cannot be
+    asked for them, so the undo restores where they begin. Other C libraries are left as they are."""
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        yield
+        return
+    mallopt(TRIM_THRESHOLD, KEPT)
+    mallopt(MMAP_THRESHOLD, OWN_MAPPING)
     yield
-    malloc_keeps(MALLOC_DEFAULT, MALLOC_DEFAULT)
+    mallopt(TRIM_THRESHOLD, MALLOC_DEFAULT)
+    mallopt(MMAP_THRESHOLD, MALLOC_DEFAULT)
 
 
 PATCHES = (_show_errors, _hide_notices)
-TRAINING_PATCHES = (_keep_freed_memory,)
+TRAINING_PATCHES = (keep_freed_memory,)
 """Each makes a change of the host that lasts until it is undone; its docstring says of what, and why."""
 _entered: dict[Callable[[], AbstractContextManager[None]], AbstractContextManager[None]] = {}
 
@@ -130,29 +139,6 @@ def enter_command(training: bool = False) -> None:
         if patch not in _entered:
             _entered[patch] = patch()
             _entered[patch].__enter__()
-
-
-def undo() -> None:
-    """Takes all patches back, the last one first."""
-    while _entered:
-        _entered.popitem()[1].__exit__(None, None, None)
-
-
-def malloc_keeps(freed: int, own_mapping: int) -> bool:
-    """Sets glibc's thresholds, in bytes, for giving back freed memory and for mapping an array by itself.
-
-    A training step takes again what the last one freed. glibc's defaults give much of it back to the system, which then
-    hands out zeroed pages: thousands of page faults a step. glibc adapts its defaults and cannot be asked for them, so
-    an undo restores where they begin.
-
-    Returns:
-        Whether it does so: other C libraries are left as they are.
-    """
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):
-        return False
-    return bool(mallopt(TRIM_THRESHOLD, freed)) and bool(mallopt(MMAP_THRESHOLD, own_mapping))
 
 
 def give_back_freed_memory() -> None:
@@ -186,21 +172,19 @@ def transforms_changed(parser: ModuleType, change: Callable[[dict[str, Any], Pat
         parser.load_from_json = read  # type: ignore[attr-defined]
 
 
-class Uninterrupted:
-    """No trace function runs in this thread within the block.
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Within the block no trace function runs in this thread.
 
     The viewer stops a rendering by a trace function that raises before some line of Python. Where that line is the end
     of ``with lock:``, the lock would never be released.
     """
-
-    def __enter__(self) -> None:
-        self._trace: Any = sys.gettrace()
-        sys.settrace(None)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        sys.settrace(self._trace)
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(trace)
 
 
 @contextmanager

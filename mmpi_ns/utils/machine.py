@@ -1,11 +1,10 @@
-"""Processor, free memory and cores of the machine, a GPU that torch does not use, and the commit of this package."""
+"""Processor, free memory and cores of the machine, and a GPU that torch does not use."""
 
 from __future__ import annotations
 
 import os
 import platform
 import re
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -106,9 +105,3 @@ def processor() -> str:
     text = info.read_text(encoding="utf-8") if info.is_file() else ""
     names = re.findall(r"model name\s*: (.*)", text)
     return f"{os.cpu_count()} cores of {names[0] if names else platform.processor()}"
-
-
-def commit() -> str:
-    """Short hash of the commit that this package is checked out at; "unknown" where it is installed."""
-    words = ["git", "-C", str(Path(__file__).resolve().parent), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"

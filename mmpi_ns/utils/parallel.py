@@ -13,7 +13,7 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
-from mmpi_ns.utils.host import Uninterrupted
+from mmpi_ns.utils.host import uninterrupted
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -42,7 +42,7 @@ def torch_apart() -> Iterator[None]:
     block = object()
     try:
         try:
-            with Uninterrupted(), _Apart.lock:
+            with uninterrupted(), _Apart.lock:
                 # A thread that began within a block keeps torch's one thread after it.
                 _Apart.threads = max(_Apart.threads, torch.get_num_threads())
                 _Apart.blocks.add(block)
@@ -55,7 +55,7 @@ def torch_apart() -> Iterator[None]:
 
 
 def _leave(block: object) -> None:
-    with Uninterrupted(), _Apart.lock:
+    with uninterrupted(), _Apart.lock:
         if block in _Apart.blocks:
             _Apart.blocks.remove(block)
             if not _Apart.blocks:

@@ -26,7 +26,6 @@ from mmpi_ns.capture.moving_objects import (
     grown,
     seeds,
     unexplained,
-    without_holes,
 )
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Parallax, View, camera_matrix
@@ -363,15 +362,6 @@ def test_seeds_count_half_where_neighbours_say_nothing():
     judged = np.ones(SIZE, bool)
     judged[4:57, 20:30] = False
     assert grown(*a_scene(np.full((*SIZE, 3), 200, np.uint8), judged=judged), core).any()
-
-
-def test_holes_are_filled_and_bays_are_not():
-    mask = np.zeros((9, 9), bool)
-    mask[1:8, 1:8] = True
-    mask[3:5, 3:5] = False
-    mask[7, 4] = False
-    filled = without_holes(mask)
-    assert filled[3:5, 3:5].all() and not filled[7, 4] and not filled[0].any()
 
 
 def test_unknown_pixels_take_the_depth_of_the_nearest_known():

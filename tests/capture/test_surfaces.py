@@ -106,9 +106,9 @@ def test_steps_in_depth_have_a_margin():
     planes[5, 3, 0] = 0.95 * planes[5, 2, 0]  # no step
     error = np.full((20, 30), 0.01, np.float32)
     error[0, 0] = 0
-    kept = Surfaces(planes, error).without_edges()
-    assert not kept.error[:, 10:14].any() and (kept.error[1:, :10] > 0).all() and (kept.error[:, 14:] > 0).all()
-    assert kept.inverse[0, 0] == 0
+    inverse, error = Surfaces(planes, error).enlarged(error.shape)
+    assert not error[:, 10:14].any() and (error[1:, :10] > 0).all() and (error[:, 14:] > 0).all()
+    assert inverse[0, 0] == 0 and np.array_equal(inverse > 0, error > 0)
 
 
 def test_where_nothing_can_be_compared_there_are_no_surfaces():

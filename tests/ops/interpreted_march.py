@@ -13,6 +13,7 @@ from hand_made import make_mpi, random_mpi
 from hard_rays import HARD_RAYS, hard_plan, hard_rays
 from interpreting import by_torch, interpreted, normal  # noqa: F401
 from random_fields import OracleRay, bundle, fill, random_field, random_rays, render
+from random_scenes import dense_grad
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
@@ -228,7 +229,7 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
         colors = next(iter(field.get_outputs(samples, lookup).values()))
         loss = (composite.render_colors(made, colors) * upstream).sum() + made.accumulation.sum()
         (loss + 0.1 * field.total_variation(lookup, 1.0, 1.0)).backward()
-        return {n: p.dense_grad() if isinstance(p, Table) else p.grad for n, p in params.items()}
+        return {n: dense_grad(p) if isinstance(p, Table) else p.grad for n, p in params.items()}
 
     fast, plain = gradients(), by_torch(gradients)
     for name in ("density", "features", "reliability", "networks.weights"):

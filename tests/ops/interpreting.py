@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from gpu_parts import interpret
 
 from mmpi_ns.ops import dispatch
 
@@ -12,10 +13,10 @@ from mmpi_ns.ops import dispatch
 def interpreted(monkeypatch):
     """Every test runs on the kernels; one that silently took plain torch would test nothing."""
     monkeypatch.setattr(dispatch, "_chosen", "auto")
-    dispatch.interpret(True)
+    interpret(True)
     assert dispatch.form_of("march", torch.zeros(1)) == "gpu"
     yield
-    dispatch.interpret(False)
+    interpret(False)
 
 
 def by_torch(work):

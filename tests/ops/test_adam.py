@@ -191,12 +191,11 @@ def test_forgotten_moments_start_afresh():
     param = Parameter(table())
     optimizer = TouchedAdam([param], **SETTINGS)
     run(param, gradients((8, 3), 3), optimizer)
-    optimizer.reset_moments(param)
+    optimizer.state.pop(param)
     param.data = torch.zeros(20, 3, dtype=torch.float64)  # grown
     param.grad = torch.ones(20, 3, dtype=torch.float64)
     optimizer.step()
     assert torch.allclose(param, torch.full_like(param, -0.1))
-    optimizer.reset_moments(Parameter(torch.zeros(1)))  # one that was never seen
 
 
 def test_tiny_and_huge_gradients_give_finite_steps():

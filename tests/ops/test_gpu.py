@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from gpu_parts import interpret
 from random_fields import bundle, random_field, random_rays, render
 from triton_processes import HERE, needs_triton, python
 from waits import TRAININGS, counted_on_a_gpu, waits_of_phases
@@ -150,11 +151,11 @@ def no_triton(monkeypatch):
 
 def test_without_triton_plain_torch_runs_and_the_log_says_so(monkeypatch, no_triton, capsys):
     with pytest.raises(ValueError, match="TRITON_INTERPRET=1"):
-        dispatch.interpret(True)
+        interpret(True)
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     with pytest.raises(ValueError, match="Triton is not available"):
-        dispatch.interpret(True)
-    assert not dispatch._interpreting
+        interpret(True)
+    assert not dispatch.interpreting
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("Plain torch instead of the compiled operations") == 1 and "Triton cannot be imported" in said
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from bricked import bricked_field
 from compiled import both, compiled, normal  # noqa: F401
+from random_scenes import dense_grad
 
 from mmpi_ns.field.tables import TexelTables
 from mmpi_ns.ops.gather import Taps
@@ -56,7 +57,7 @@ def test_fast_path_equals_the_reference_with_its_gradient(channels, corners, dty
     out.backward(upstream)
     exact.backward(upstream)
     assert torch.equal(table.grad_rows, rows.unique()) and table.grad.shape == (len(rows.unique()), channels)
-    assert torch.allclose(table.dense_grad(), plain.grad, atol=10 * error, rtol=10 * error)
+    assert torch.allclose(dense_grad(table), plain.grad, atol=10 * error, rtol=10 * error)
 
 
 def test_gradients_of_rows_and_weights_are_finite_differences():
@@ -70,7 +71,7 @@ def test_two_lookups_in_one_table_add_their_gradients():
     table, plain = Table(values.clone()), values.clone().requires_grad_()
     for t, function in ((table, interpolate), (plain, interpolate_densely)):
         (function(t, rows[:9], weights[:9]).sum() + 2 * (function(t, rows[5:20], weights[5:20]) ** 2).sum()).backward()
-    assert torch.equal(table.grad_rows, rows[:20].unique()) and torch.allclose(table.dense_grad(), plain.grad)
+    assert torch.equal(table.grad_rows, rows[:20].unique()) and torch.allclose(dense_grad(table), plain.grad)
 
 
 def test_a_dropped_gradient_is_gone_and_its_rows_with_it():
@@ -81,17 +82,17 @@ def test_a_dropped_gradient_is_gone_and_its_rows_with_it():
         interpolate(table, rows[part], weights[part]).sum().backward()
     assert torch.equal(table.grad_rows, rows[5:7].unique())
     table.grad = None
-    assert table.grad is None and table.grad_rows is None and table.dense_grad() is None
+    assert table.grad is None and table.grad_rows is None and dense_grad(table) is None
 
 
 def test_hosts_scale_clip_and_drop_the_gradient_as_they_do_any():
     values, rows, weights = lookup(dtype=torch.float32)
     table = Table(values)
     interpolate(table, rows, weights).sum().backward()
-    before = table.dense_grad()
+    before = dense_grad(table)
     torch.nn.utils.clip_grad_norm_([table], 0.5)
     assert table.grad.norm() == pytest.approx(0.5, rel=1e-4)
-    assert torch.allclose(table.dense_grad(), before * 0.5 / before.norm(), rtol=1e-4)
+    assert torch.allclose(dense_grad(table), before * 0.5 / before.norm(), rtol=1e-4)
     torch.optim.SGD([table], lr=1.0).zero_grad()
     assert table.grad is None
 
@@ -192,7 +193,7 @@ def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each(channe
     ((read * upstream).sum() + 2 * part.sum()).backward()
     ((wanted * upstream).sum() + 2 * wanted[some].sum()).backward()
     assert torch.equal(table.grad_rows, index.unique)
-    assert torch.allclose(table.dense_grad(), plain.grad, atol=1e-5)
+    assert torch.allclose(dense_grad(table), plain.grad, atol=1e-5)
 
 
 @pytest.mark.parametrize("taps", [4, 8])

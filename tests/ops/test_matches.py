@@ -89,7 +89,7 @@ def test_matches_tell_the_depth_and_how_certain_it_is(seed):
         there, is_ahead[r, c] = place(linear, b, r, c, expected[r, c])
         off[r, c], parallax[r, c] = np.hypot(*(there - at[r, c])), np.hypot(*equations[0]) / is_ahead[r, c]
     maps = tensors(at[..., 0], at[..., 1], alike)
-    solved = solve_matches(*maps, torch.from_numpy(usable), *tensors(linear, b), FIRST_ROW, NOISE, FARTHEST)
+    solved = solve_matches(*maps, torch.from_numpy(usable), *tensors(linear, b), FIRST_ROW, NOISE**2, FARTHEST**2)
     inverse, certainty = (x.numpy() for x in solved)
     sure = (is_ahead > 0.1) & (parallax > 3) & (np.abs(off - FARTHEST) > 0.01)
     kept = sure & usable & (off < FARTHEST)
@@ -108,7 +108,7 @@ def test_matches_that_tell_no_depth_have_none(what):
     if what == "behind":
         linear[2, 2] = -1
     maps, usable = tensors(x + 0.5, y, alike), torch.ones(x.shape, dtype=torch.bool)
-    inverse, certainty = solve_matches(*maps, usable, *tensors(linear, b), FIRST_ROW, NOISE, FARTHEST)
+    inverse, certainty = solve_matches(*maps, usable, *tensors(linear, b), FIRST_ROW, NOISE**2, FARTHEST**2)
     assert certainty.max() < 1e-9 and not inverse.any()
 
 
@@ -154,14 +154,14 @@ def averaged_slowly(inverse, weight):
     return (mean, error) if best > 0 and error < MOST_RELATIVE * mean else (0.0, 0.0)
 
 
-@pytest.mark.parametrize("measurements", [1, 2, 4, 7])
+@pytest.mark.parametrize("measurements", [1, 2, 4, 7, 20])
 def test_the_largest_group_that_agrees_is_averaged(measurements):
     rng = np.random.default_rng(measurements)
     shape = measurements, 601
     inverse = rng.choice([0.2, 0.201, 0.21, 0.3, -0.1], shape) + rng.normal(0, 5e-4, shape)
     weight = rng.choice([0, 10, 1e4, 1e6, 1e7], shape)
     inverse, weight = (x.astype(np.float32) for x in (np.where(weight > 0, inverse, 0), weight))
-    mean, error = (x.numpy() for x in average_matches(*tensors(inverse, weight), MOST_RELATIVE))
+    mean, error = (x[0].numpy() for x in average_matches(*tensors(inverse[:, None], weight[:, None]), MOST_RELATIVE))
     pixels = zip(inverse.T.astype(float), weight.T.astype(float), strict=True)
     expected = np.array([averaged_slowly(q, w) for q, w in pixels])
     same = np.isclose(mean, expected[:, 0], rtol=1e-5) & np.isclose(error, expected[:, 1], rtol=1e-3)
@@ -170,4 +170,4 @@ def test_the_largest_group_that_agrees_is_averaged(measurements):
 
 def test_wrong_shapes_are_refused():
     with pytest.raises(ValueError, match="has the shape"):
-        average_matches(torch.ones(3, 5), torch.ones(3, 4), MOST_RELATIVE)
+        average_matches(torch.ones(3, 1, 5), torch.ones(3, 1, 4), MOST_RELATIVE)

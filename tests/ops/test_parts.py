@@ -21,7 +21,7 @@ def taken(parts, seed=0):
     slots = torch.randperm(COUNT, generator=torch.Generator().manual_seed(seed))
     numbers, chosen = torch.full((COUNT,), -1, dtype=torch.int32), torch.ones(COUNT, dtype=torch.bool)
     bounds = [COUNT * i // parts for i in range(parts + 1)]
-    build.run_in_parts("mmpi_number_samples", bounds, slots, chosen, 1, numbers)
+    build.call_in_parts("mmpi_number_samples", bounds, slots, chosen, 1, numbers)
     return torch.equal(numbers.long(), slots.argsort())
 
 
@@ -33,7 +33,7 @@ def test_every_part_is_done_once_and_before_the_call_ends(parts):
 def test_every_part_has_a_number_of_its_own():
     words, counts = torch.full((6,), 3), torch.full((3,), -1)
     for _ in range(200):
-        build.run_in_parts("mmpi_count_rows", [0, 1, 3, 6], words, counts.fill_(-1))
+        build.call_in_parts("mmpi_count_rows", [0, 1, 3, 6], words, counts.fill_(-1))
         assert counts.tolist() == [2, 4, 6]
 
 

@@ -25,10 +25,10 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     texels = torch.cat([g.rows for g in grids])
     table = normal(len(grids[0].places) * 64, channels) * 2
     rows = texels[torch.randperm(plan.texels, generator=torch.Generator().manual_seed(1))[: plan.texels - 9]]
-    found = []
+    found, scales = [], torch.tensor([(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)])
     for function in (total_variation, total_variation.reference):
         values = table[rows].requires_grad_()
-        value = function(values, table, rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)])
+        value = function(values, table, rows, layout, scales)
         (3 * value).backward()
         found.append((value.item(), values.grad))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-5) and found[0][0] > 1
@@ -42,19 +42,19 @@ def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(chann
     table = normal(len(grids[0].places) * BRICK, channels) * 2
     rows = torch.cat([g.rows for g in grids]).sort()[0]
     assert len(rows) > 3 * PART
-    found, threads = [], torch.get_num_threads()
+    found, threads, scales = [], torch.get_num_threads(), torch.tensor([(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
     for count in (1, 3):
         values = table[rows].requires_grad_()
         try:
             torch.set_num_threads(count)
-            value = total_variation(values, table, rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
+            value = total_variation(values, table, rows, layout, scales)
             value.backward()
         finally:
             torch.set_num_threads(threads)
         found.append((value, values.grad))
     assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
     values = table[rows].double().requires_grad_()
-    wanted = total_variation.reference(values, table.double(), rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
+    wanted = total_variation.reference(values, table.double(), rows, layout, scales)
     wanted.backward()
     assert found[0][0].item() == pytest.approx(wanted.item(), rel=1e-6)
     assert torch.allclose(found[0][1].double(), values.grad, atol=2e-6)
@@ -65,7 +65,7 @@ def test_arrays_of_a_wrong_shape_are_refused(rows, values, heads, more):
     layout = layout_of([(2, 9, 9)])
     table = normal(len(layout.grids[0].places) * BRICK + more, 3)
     with pytest.raises(ValueError, match="where"):
-        total_variation(normal(values, 3), table, torch.arange(rows), layout, [(1.0, 1.0, 1.0)] * heads)
+        total_variation(normal(values, 3), table, torch.arange(rows), layout, torch.ones(heads, 3))
 
 
 def test_variation_says_where_a_texel_is_not_a_number():
@@ -76,7 +76,7 @@ def test_variation_says_where_a_texel_is_not_a_number():
     table[broken, 4] = math.nan
     rows = grids[0].rows.sort()[0]
     values = table[rows].requires_grad_()
-    value = total_variation(values, table, rows, layout, [(1.0, 1.0, 1.0)])
+    value = total_variation(values, table, rows, layout, torch.ones(1, 3))
     value.backward()
     own = (rows == broken).nonzero().item()
     assert value.isnan() and values.grad[own, 4].isnan() and values.grad.isnan().sum() == 1 + 4, "and its neighbours"

@@ -112,10 +112,11 @@ def test_a_candidates_errors_are_those_of_the_mpi_or_cube_made_of_it():
 
 def test_a_cube_costs_what_its_largest_grid_can_show():
     cube = CubePlan((0.0,) * 3, (1.0,) * 3, (2, 2, 2))
-    candidate = Candidate(cube, 400.0, 400.0, np.zeros(1, np.float32), np.ones(1, np.float32))
-    assert candidate.coarsest(100) == 4 and candidate.at(1.0, 0, 100).texels == 100**3
-    assert candidate.at(8.0, 0, 100).texels == 50**3
-    assert Candidate(mpi(), 400.0, 400.0, np.zeros(1), np.ones(1)).coarsest(100) == 0
+    frames = [Candidate(f, 400.0, 400.0, np.zeros(1, np.float32), np.ones(1, np.float32)) for f in (cube, mpi())]
+    assert [frames[0].at(size, 0, 100).texels for size in (1.0, 8.0)] == [100**3, 50**3]
+    config = PlacementConfig(max_voxels=100, enough=0.25)
+    costs = [_Choice(frames, np.ones(1), config, size).cost[:, 0] for size in (1.0, 4.0)]
+    assert costs[0].tolist() == [3, 1] and costs[1].tolist() == [1, 1]  # a texel of the cube spans 4 pixels at least
 
 
 def test_texel_error_takes_the_worse_side_and_each_side_its_own_focal_length():

@@ -147,7 +147,7 @@ def test_variation_beside_released_bricks_equals_float64(channels, order):
     mixed = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(3))]
     rows = rows.sort()[0] if order == "rising" else mixed
     table = torch.randn(len(grids[0].places) * BRICK, channels, generator=torch.Generator().manual_seed(0)) * 2
-    scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
+    scales, found = torch.tensor([(0.5 + k, 2.0, 1.0) for k in range(len(grids))]), []
     for function, dtype in ((total_variation, torch.float32), (total_variation.reference, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
         value = function(values, table.to(dtype), rows, layout, scales)
@@ -201,20 +201,20 @@ def test_the_empty_brick_never_changes(monkeypatch, route):
 def test_growth_equals_dense_growth_where_everything_around_is_stored_and_goes_on_from_there():
     shapes, wider = [(3, 16, 21), (2, 24, 30), (4, 9, 17)], [(3, 23, 30), (2, 34, 42), (6, 13, 24)]
     is_cube = [False, False, True]
-    full = make_grids(shapes)
+    full = make_grids(shapes, None, True)
     dense = new_table(full[0].tiles, 2, dtype=torch.float64).normal_(generator=torch.Generator().manual_seed(0))
     keep = chance(len(full[0].places), 0.7)
     keep[0] = True
     tiles, kept = number_tiles(keep[1:]), keep.nonzero()[:, 0]
-    some, thin = make_grids(shapes, tiles), dense.view(-1, BRICK, 2)[kept].reshape(-1, 2)
+    some, thin = make_grids(shapes, tiles, True), dense.view(-1, BRICK, 2)[kept].reshape(-1, 2)
     thin[:BRICK] = -20.0
-    wide = make_grids(wider)
-    reached = grown_tiles(some, wide, is_cube, None)
-    bricks = make_grids(wider, reached)
-    found, wanted = resample(thin, some, bricks, is_cube, -20.0), resample(dense, full, wide, is_cube)
+    wide = make_grids(wider, None, True)
+    reached = grown_tiles(some, wide, None)
+    bricks = make_grids(wider, reached, True)
+    found, wanted = resample(thin, some, bricks, -20.0), resample(dense, full, wide)
     flat = torch.full_like(thin, 3.0)
     flat[:BRICK] = -20.0
-    flat = resample(flat, some, bricks, is_cube, -20.0)
+    flat = resample(flat, some, bricks, -20.0)
     exact = 0
     for k, (a, b) in enumerate(zip(bricks, wide, strict=True)):
         stored = (some[k].rows >= BRICK).float().view(*shapes[k], 1)
@@ -249,15 +249,15 @@ def test_a_tile_is_stored_where_half_of_a_texel_comes_from_stored_ones(wider):
         fy, fx = v - below, u - right
         share = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
         wanted[z, y // 8, x // 8] |= share > 0.4999
-    kept = grown_tiles(old, new, [False], None, 0.4999).view(wanted.shape) > 0
+    kept = grown_tiles(old, new, None, 0.4999).view(wanted.shape) > 0
     assert np.array_equal(kept.numpy(), wanted)
-    assert wanted.sum() < (grown_tiles(old, new, [False], None) > 0).sum() or wider == (24, 31)
+    assert wanted.sum() < (grown_tiles(old, new, None) > 0).sum() or wider == (24, 31)
 
 
 def test_growth_stores_only_what_training_rays_reach():
     old, new = make_grids([(2, 16, 16)]), make_grids([(2, 32, 32)])
     reachable = chance(32, 0.5)
-    assert torch.equal(grown_tiles(old, new, [False], reachable) > 0, reachable)
+    assert torch.equal(grown_tiles(old, new, reachable) > 0, reachable)
 
 
 # Release -------------------------------------------------------------------------------------------------------------

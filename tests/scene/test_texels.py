@@ -135,7 +135,7 @@ def test_resampling_keeps_what_is_linear_and_lookups_of_it(plan):
         return table
 
     old, new = head_grids(plan), head_grids(plan.scaled(4))
-    resampled = resample(linear(old), old, new, [False, False, True])
+    resampled = resample(linear(old), old, new)
     assert [g.width for g in new] == [14, 14, 8]
     assert resampled.shape == linear(new).shape
     assert all(torch.allclose(resampled[g.rows], linear(new)[g.rows], atol=1e-12) for g in new)
@@ -143,17 +143,17 @@ def test_resampling_keeps_what_is_linear_and_lookups_of_it(plan):
 
 def test_resampling_keeps_planes_apart_and_corners_exact(plan, table):
     old, new = head_grids(plan), head_grids(plan.scaled(2))
-    resampled = resample(table, old, new, [False, False, True])
+    resampled = resample(table, old, new)
     for a, b in zip(old, new, strict=True):
         before, after = block(table, a), block(resampled, b)
         assert np.array_equal(after[0, 0, 0], before[0, 0, 0]) and np.array_equal(after[-1, -1, -1], before[-1, -1, -1])
     lonely = torch.zeros(len(table), 1, dtype=F64)
     lonely[old[0].rows[4 * 35 : 5 * 35]] = 1
-    spread = block(resample(lonely, old, new, [False, False, True]), new[0])
+    spread = block(resample(lonely, old, new), new[0])
     assert (spread[4] == 1).all() and spread.sum() == spread[4].size
 
 
 def test_resampling_to_the_same_size_changes_nothing(plan, table):
     grids = head_grids(plan)
-    found = resample(table, grids, grids, [False, False, True])
+    found = resample(table, grids, grids)
     assert all(torch.equal(found[g.rows], table[g.rows]) for g in grids)

@@ -107,10 +107,10 @@ def test_tiles_of_all_images_are_those_of_each_alone_and_found_once(monkeypatch,
     monkeypatch.setattr(visible_tiles, "_tiles_of", lambda *given: looks.append(given) or tiles_of(*given))
     visible_tiles._packed_tiles.cache_clear()
     whole = reachable_tiles(views, plan)
-    alone = [reachable_tiles(views.some(np.array([i])), plan) for i in range(count)]
+    alone = [reachable_tiles(TrainingViews(*(x[i : i + 1] for x in vars(views).values())), plan) for i in range(count)]
     assert torch.equal(whole, torch.stack(alone).any(0)) and not whole.all()
     before = len(looks)
-    again = reachable_tiles(views.some(np.arange(count)), plan, "cuda")
+    again = reachable_tiles(TrainingViews(*(x.clone() for x in vars(views).values())), plan, "cuda")
     assert torch.equal(again, whole) and len(looks) == before
     again[:] = True
     assert torch.equal(reachable_tiles(views, plan), whole), "nobody writes into what is remembered"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from random_scenes import bundle_of, of_slots, render
+from random_scenes import bundle_of, dense_grad, of_slots, render
 from stability.cases import (
     UNIT,
     Case,
@@ -174,7 +174,7 @@ def gradients_of(field: MMPIField, found: RenderedRays, by: Array) -> dict[str, 
     field.zero_grad()
     found.colors.rgb.backward(float32(by).to(field.density.device))
     read = {name: table for name, table in tables.items() if table.grad is not None}
-    return {n: as_array(t.dense_grad()[texels] if isinstance(t, Table) else t.grad) for n, t in read.items()}
+    return {n: as_array(dense_grad(t)[texels] if isinstance(t, Table) else t.grad) for n, t in read.items()}
 
 
 def measure(make: Callable[[], Scene], precision: Precision) -> Outcome:

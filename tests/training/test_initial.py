@@ -27,7 +27,7 @@ def field_of(plan, **options):
 
 
 def votes_of(field, origins, directions, depths, colors):
-    votes = Votes(len(field.density), "cpu")
+    votes = Votes(*(torch.zeros(len(field.density), *more) for more in ((), (), (3,))))
     parts = (torch.tensor(np.asarray(x), dtype=torch.float32) for x in (origins, directions, depths, colors))
     votes.add(field.layout, *parts, field.plan.ray_near)
     return votes

@@ -97,7 +97,7 @@ def test_what_a_step_frees_is_there_for_the_next_one():
     """Page faults of arrays that are taken and freed again and again, in a process of its own."""
     work = """if True:
         import resource, torch
-        from mmpi_ns.utils.host import KEPT, OWN_MAPPING, malloc_keeps
+        from mmpi_ns.utils.host import keep_freed_memory
         def faults():
             before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
             for _ in range(5):
@@ -105,7 +105,7 @@ def test_what_a_step_frees_is_there_for_the_next_one():
                 del parts
             return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
         first = faults()
-        assert malloc_keeps(KEPT, OWN_MAPPING)
+        (keeping := keep_freed_memory()).__enter__()
         faults()
         print(first, faults())
     """
@@ -122,11 +122,11 @@ def test_what_steps_leave_is_given_back_before_tables_grow_and_zeros_take_nothin
         from pathlib import Path
         from mmpi_ns.scene.bricks import resample
         from mmpi_ns.scene.texels import BRICK, make_grids
-        from mmpi_ns.utils.host import KEPT, OWN_MAPPING, give_back_freed_memory, malloc_keeps
+        from mmpi_ns.utils.host import give_back_freed_memory, keep_freed_memory
         from mmpi_ns.utils.machine import lazy_zeros
         def resident():
             return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") >> 20
-        assert malloc_keeps(KEPT, OWN_MAPPING)
+        (keeping := keep_freed_memory()).__enter__()
         parts = [torch.ones(n) for _ in range(40) for n in (1 << 20, 1 << 10)]
         del parts[::2]
         before = resident()
@@ -135,7 +135,7 @@ def test_what_steps_leave_is_given_back_before_tables_grow_and_zeros_take_nothin
         old, new = make_grids([(8, 256, 256)]), make_grids([(16, 1024, 1024)])
         before = resident()
         nothing = lazy_zeros((len(old[0].places) * BRICK, 1), torch.float32, torch.device("cpu"))
-        table = resample(nothing, old, new, [False])
+        table = resample(nothing, old, new)
         assert table.shape == (len(new[0].places) * BRICK, 1) and not table[::1000].any()
         print(given, resident() - before)
     """

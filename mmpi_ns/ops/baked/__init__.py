@@ -19,7 +19,7 @@ from mmpi_ns.ops.composite import median_inverse_distance, winning_heads
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import OPAQUE_BAKED
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.ops.layout import dense, frame_rows, shaped
+from mmpi_ns.ops.layout import dense, dense_fields, frame_rows, shaped
 from mmpi_ns.ops.march import shown
 from mmpi_ns.ops.march.rays import Rays, Shown
 from mmpi_ns.scene.baked import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, tiles_of
@@ -116,7 +116,7 @@ def _pack(baked: BakedMpis) -> ctypes.Array:
         *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (density, texels)),
         *(pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)),
     ]
-    mpis = pad(frame_rows(Frames.pack(baked.mpis)), (0, 7))  # of the rest of ``SceneLayout.head_rows`` nothing is read
+    mpis = pad(frame_rows(Frames.pack(baked.mpis)), (0, 7))  # nothing is read of the rest of ``SceneLayout.constants``
     return structs((count, channels, mpis, structs(*stacks), structs(through), *tables))
 
 
@@ -126,7 +126,7 @@ def show_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Ten
         scene.packed["cpu"] = _pack(scene)
     if peaks is not None:
         assert dense(peaks)[0] is peaks, "peaks are written in place"
-    walk = (scene.packed["cpu"], structs(rays.dense()), float(threshold), peaks)
+    walk = (scene.packed["cpu"], structs(dense_fields(rays)), float(threshold), peaks)
     return shown("mmpi_show_baked", len(rays.origins), len(scene.channel_codes), *walk)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -85,14 +86,16 @@ class _Compiled(torch.autograd.Function):
         return None, grad, None, None, None
 
 
-def composited(run: Callable[..., None], tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> Composite:
+def composited(
+    run: Callable[..., None], tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor
+) -> Composite:
     """``composite_weights`` by a compiled form.
 
     Args:
         run: calls the function "mmpi_composite" or "mmpi_composite_back" of numbers of rays and slots, and tensors.
-        tau, valid, before, total: arguments of ``composite_weights``.
+        tau, valid, skipped_before, skipped_total: arguments of ``composite_weights``.
     """
-    tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(before, total))
+    tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(skipped_before, skipped_total))
     weights, depth = _Compiled.apply(run, *tensors)  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
 
@@ -130,6 +133,4 @@ def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_
     return mass.argmax(-1, keepdim=True).to(weights.dtype)
 
 
-@composite_weights.on_cpu
-def composite_weights_on_cpu(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
-    return composited(call_in_parts, tau, valid, skipped_before, skipped_total)
+composite_weights.on_cpu(partial(composited, call_in_parts))

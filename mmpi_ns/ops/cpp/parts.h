@@ -102,5 +102,5 @@ template <class... A, void (*F)(int64_t, int64_t, A...)> struct InParts<F> {
     }
 };
 
-// Makes an operation of (begin, end, ...) callable for all parts between bounds (ops/build.run_in_parts).
+// Makes an operation of (begin, end, ...) callable for all parts between bounds (ops/build.call_in_parts).
 #define IN_PARTS(NAME) extern "C" { void* NAME##_in_parts = reinterpret_cast<void*>(&InParts<&NAME>::run); }

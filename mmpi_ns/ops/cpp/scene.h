@@ -4,7 +4,7 @@
 #include <cmath>
 #include <cstdint>
 
-// Of an MPI (layout.head_rows).
+// Of an MPI (layout.constants).
 struct Mpi {
     float origin[3], axes[3][3], extent[4]; // u0, u1, v0, v1
     float step, end, last; // disparity between planes and of the last one, 1 / far (0 at infinity); number of the first one

@@ -61,9 +61,11 @@ def depth_sums(
 
 class _DepthSums(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, scale: float, valid: Tensor, *floats: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, weights: Tensor, inverse_t: Tensor, valid: Tensor, intervals: Tensor, targets: Tensor, scale: float
+    ) -> tuple[Tensor, ...]:
         rays, slots = valid.shape
-        arrays = [*dense(valid, dtype=torch.bool), *dense(*floats)]
+        arrays = [*dense(valid, dtype=torch.bool), *dense(weights, inverse_t, intervals, targets)]
         sums = [*torch.empty(2, rays), torch.empty(rays, dtype=torch.bool)]
         call_in_parts("mmpi_depth_sums", rays, slots, scale, *arrays, *sums)
         ctx.save_for_backward(*arrays)
@@ -76,11 +78,11 @@ class _DepthSums(torch.autograd.Function):
         valid, weights, *_ = saved = ctx.saved_tensors
         gradient = torch.empty_like(weights)
         call_in_parts("mmpi_depth_sums_back", *valid.shape, ctx.scale, *saved, *dense(*grad_outputs[:2]), gradient)
-        return None, None, gradient, None, None, None
+        return gradient, None, None, None, None, None
 
 
-@depth_sums.on_cpu
-def depth_sums_on_cpu(
-    weights: Tensor, inverse_t: Tensor, valid: Tensor, intervals: Tensor, targets: Tensor, scale: float
-) -> DepthSums:
-    return DepthSums(*_DepthSums.apply(scale, valid, weights, inverse_t, intervals, targets))  # type: ignore[misc]
+depth_sums.on_cpu(
+    lambda weights, inverse_t, valid, intervals, targets, scale: DepthSums(
+        *_DepthSums.apply(weights, inverse_t, valid, intervals, targets, scale)  # type: ignore[misc]
+    )
+)

@@ -9,10 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from mmpi_ns.ops.build import HEADERS, call_in_parts
-from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.build import HEADERS
+from mmpi_ns.ops.dispatch import in_cpp, operation
 from mmpi_ns.ops.ends import numbers_in
-from mmpi_ns.ops.layout import dense
 
 TEXT = (HEADERS / "details.h").read_text(encoding="utf-8")
 """Lines that both C++ and GLSL understand: the numbers below with what they mean, and the weights."""
@@ -98,11 +97,4 @@ def seen_details(
     return SeenDetails(faded, torch.where(inside[:, None] & (there >= 0), agrees, 0.0))
 
 
-@seen_details.on_cpu
-def seen_details_on_cpu(
-    origins: Tensor, directions: Tensor, inverse: Tensor, image: Tensor, camera: Tensor
-) -> SeenDetails:
-    seen = SeenDetails(torch.empty(len(origins), 3), torch.empty(len(origins), 1))
-    arrays = dense(origins, directions, inverse, image, camera)
-    call_in_parts("mmpi_seen_details", len(origins), *image.shape[:2], *arrays, *seen)
-    return seen
+in_cpp(seen_details, least=256)

@@ -49,8 +49,8 @@ void look_up(const float* image, int64_t height, int64_t width, float column, fl
 }
 
 // Rays [begin, end): the image's values at their surfaces, and weights.
-void mmpi_seen_details(int64_t begin, int64_t end, int64_t height, int64_t width, const float* origins,
-                       const float* directions, const float* inverse, const float* image, const float* numbers,
+void mmpi_seen_details(int64_t begin, int64_t end, const float* origins, const float* directions, const float* inverse,
+                       const float* image, const float* numbers, int64_t, int64_t height, int64_t width,
                        float* difference, float* weight) {
     const Camera& camera = *reinterpret_cast<const Camera*>(numbers);
     for (int64_t i = begin; i < end; i++) {

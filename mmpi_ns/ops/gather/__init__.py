@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import call_in_parts, owned_bounds, run_in_parts, structs
+from mmpi_ns.ops.build import call_in_parts, owned_bounds, structs
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.interpolate import interpolate_densely
 from mmpi_ns.ops.layout import Places, SceneLayout
@@ -163,7 +163,7 @@ class _GatherTaps(torch.autograd.Function):
         batch = (values, *values.shape, _groups(taps, to_taps), slots, chosen, weights)
         grads = [pad(g, (0, -g.shape[1] % LANES)).contiguous() for g in (to_sums, to_first, 2 * to_second)]
         bounds = owned_bounds(taps[::2], len(values), AT_LEAST)
-        run_in_parts("mmpi_gather_back", bounds, *batch, *grads, weights.shape[1], to_values, to_weights)
+        call_in_parts("mmpi_gather_back", bounds, *batch, *grads, weights.shape[1], to_values, to_weights)
         return to_values, to_weights, None, None, *(x for to in to_taps for x in (None, to))
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int32
 from torch import Tensor, nn
 
-from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds, run_in_parts
-from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds
+from mmpi_ns.ops.dispatch import in_cpp, operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
@@ -70,12 +70,6 @@ class Table(nn.Parameter):
             index, ones = index_rows(rows[:, None], len(self), pads=True), torch.ones_like(values[:, :1])
             rows, values = index.unique, sum_rows(index.positions, values, ones, len(index.unique))
         self.grad_rows, self._row_grad = rows, values
-
-    def dense_grad(self) -> Float[Tensor, "T C"] | None:
-        """The gradient of all rows; to look at, not to train with."""
-        if self.grad_rows is None or self._row_grad is None:
-            return None
-        return torch.zeros_like(self.data).index_add_(0, self.grad_rows, self._row_grad)
 
 
 @operation()
@@ -165,7 +159,7 @@ def weigh_rows(
 
 @operation("gpu")
 def weighted_rows(
-    table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+    table: Float[Tensor, "T C"], rows: Int32[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
     """Values of ``weigh_rows``."""
     return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
@@ -226,13 +220,13 @@ def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] |
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
-    run_in_parts("mmpi_count_heads", bounds, heads, valid, num_heads, in_parts)
+    call_in_parts("mmpi_count_heads", bounds, heads, valid, num_heads, in_parts)
     totals = in_parts.sum(0)
     starts = totals.cumsum(0) - totals + in_parts.cumsum(0) - in_parts
     count = int(totals.sum())
     slots, of_heads, of_planes = torch.empty(3, count, dtype=torch.int64)
     columns = (slots, of_heads, of_planes, torch.empty(count, 3))
-    run_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
+    call_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
     return HeadSamples(*columns, totals.tolist())
 
 
@@ -256,10 +250,10 @@ def index_rows_on_cpu(rows: Tensor, table_rows: int, pads: bool = False) -> RowI
     call_in_parts("mmpi_mark_rows", count, listed, words, least=AT_LEAST)
     bounds = even_bounds(len(words), AT_LEAST)
     counts = torch.empty(len(bounds) - 1, dtype=torch.int64)
-    run_in_parts("mmpi_count_rows", bounds, words, counts)
+    call_in_parts("mmpi_count_rows", bounds, words, counts)
     ends = counts.cumsum(0)
     unique = torch.empty(int(ends[-1]), dtype=torch.int64)
-    run_in_parts("mmpi_list_rows", bounds, words, ends - counts, before, unique)
+    call_in_parts("mmpi_list_rows", bounds, words, ends - counts, before, unique)
     call_in_parts("mmpi_place_rows", count, listed, words, before, positions, least=AT_LEAST)
     return RowIndex(unique, positions)
 
@@ -270,23 +264,9 @@ def sum_rows_on_cpu(positions: Tensor, values: Tensor, weights: Tensor, count: i
         return sum_rows.reference(positions, values, weights, count)
     sums, entries = torch.empty(count, values.shape[1]), (x.contiguous() for x in (positions, weights, values))
     bounds = owned_bounds([positions], count, AT_LEAST)
-    run_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
+    call_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
     return sums
 
 
-@weighted_rows.on_cpu
-def weighted_rows_on_cpu(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    if rows.dtype != torch.int32 or not table.is_contiguous():
-        return weighted_rows.reference(table, rows, weights)
-    values, entries = torch.empty(len(rows), table.shape[1]), (rows.contiguous(), weights.contiguous(), rows.shape[1])
-    call_in_parts("mmpi_weigh_rows", len(rows), table, *table.shape, *entries, values, least=AT_LEAST)
-    return values
-
-
-@take_rows.on_cpu
-def take_rows_on_cpu(table: Tensor, rows: Tensor) -> Tensor:
-    if not table.is_contiguous():
-        return take_rows.reference(table, rows)
-    values = torch.empty(len(rows), table.shape[1])
-    call_in_parts("mmpi_take_rows", len(rows), rows.contiguous(), table.shape[1], table, values, least=AT_LEAST)
-    return values
+in_cpp(weighted_rows, AT_LEAST)
+in_cpp(take_rows, AT_LEAST)

@@ -44,8 +44,8 @@ void mmpi_place_rows(int64_t begin, int64_t end, const int64_t* rows, const uint
 }
 
 // Rows [begin, end) of a list, read from the table; those that follow each other as one stretch.
-void mmpi_take_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t channels, const float* table,
-                    float* values) {
+void mmpi_take_rows(int64_t begin, int64_t end, const float* table, const int64_t* rows, int64_t, int64_t channels,
+                    int64_t, float* values) {
     for (int64_t i = begin, next; i < end; i = next) {
         for (next = i + 1; next < end && rows[next] == rows[next - 1] + 1;) next++;
         for (int64_t soon = std::min(end, i + 2 * AHEAD); soon < std::min(end, next + 2 * AHEAD); soon++)
@@ -55,8 +55,8 @@ void mmpi_take_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t cha
 }
 
 // The sum of weights[n, b] * table[positions[n, b]] over b, of samples [begin, end).
-void mmpi_weigh_rows(int64_t begin, int64_t end, const float* numbers, int64_t rows, int64_t channels,
-                     const int32_t* positions, const float* weights, int64_t taps, float* values) {
+void mmpi_weighted_rows(int64_t begin, int64_t end, const float* numbers, const int32_t* positions,
+                        const float* weights, int64_t rows, int64_t channels, int64_t, int64_t taps, float* values) {
     const Table table{numbers, rows, channels};
     for (int64_t n = begin; n < end; n++)
         for (int64_t first = 0; first < channels; first += WIDTH) {
@@ -117,7 +117,7 @@ IN_PARTS(mmpi_count_rows)
 IN_PARTS(mmpi_list_rows)
 IN_PARTS(mmpi_place_rows)
 IN_PARTS(mmpi_take_rows)
-IN_PARTS(mmpi_weigh_rows)
+IN_PARTS(mmpi_weighted_rows)
 IN_PARTS(mmpi_sum_rows)
 IN_PARTS(mmpi_count_heads)
 IN_PARTS(mmpi_order_by_head)

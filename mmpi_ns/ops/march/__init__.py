@@ -22,7 +22,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.layout import Places, SceneLayout, Tables, dense
+from mmpi_ns.ops.layout import Places, SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 from mmpi_ns.scene.baked import columns_from
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
@@ -293,7 +293,7 @@ def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: March
     samples = structs(empty_samples(num_rays * room, index=torch.int32))
     starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
     explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
-    walk = (layout.cpu_scene(tables), structs(rays.dense()))
+    walk = (layout.cpu_scene(tables), structs(dense_fields(rays)))
     how = (float(options.threshold), float(options.fair_share), options.blends)
     call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, samples)
     width = max(1, int(kept.max())) if num_rays else 1
@@ -319,7 +319,7 @@ def _tiles(layout: SceneLayout) -> ctypes.Array:
 
 @show_rays.on_cpu
 def show_rays_on_cpu(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
-    walk = (layout.cpu_scene(tables), structs(rays.dense()))
+    walk = (layout.cpu_scene(tables), structs(dense_fields(rays)))
     texels = (layout.once("tiles", _tiles), *dense(features), *features.shape)
     how = (float(options.threshold), float(options.fair_share), options.blends)
     return shown("mmpi_show", len(rays.origins), features.shape[1], *walk, *texels, *how)

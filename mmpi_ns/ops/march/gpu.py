@@ -20,7 +20,7 @@ from torch import Tensor
 from mmpi_ns.ops import ends
 from mmpi_ns.ops.gather.gpu import activate, lanes, sizes
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
-from mmpi_ns.ops.layout import SceneLayout, Tables, dense
+from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 
@@ -230,18 +230,18 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
     threshold, room = float(options.threshold), options.most_kept(layout.most_samples)
     # Where all heads may answer, what stands for the choice is not read.
-    parts = [rays.origins if x is None else x for x in rays.dense()]
+    parts = [rays.origins if x is None else x for x in dense_fields(rays)]
     live = torch.empty(num_rays, dtype=torch.int64, device=device)
     explained = torch.empty(num_rays, 1, dtype=torch.bool, device=device)
     kept = torch.empty(num_rays, dtype=torch.int32, device=device)
     skipped, dropped = (torch.empty(num_rays, 1, device=device) for _ in range(2))
     slots = empty_samples(num_rays, room, index=torch.int32, device=device)
     numbers = torch.zeros(1 + num_heads, dtype=torch.int32, device=device)
-    heads = triton.next_power_of_2(num_heads)
+    heads, (head_rows, biases, cube_row) = triton.next_power_of_2(num_heads), layout.constants
     at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
     launch(
         march_kernel, num_rays, at_once, *parts,
-        layout.head_rows, grids_of(layout), layout.bias_row, layout.cube_row, *tables.dense(),
+        head_rows, grids_of(layout), biases, cube_row, *dense_fields(tables),
         live, explained, kept, skipped, dropped, *slots, numbers,
         num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
         K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,

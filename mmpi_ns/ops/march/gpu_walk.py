@@ -36,7 +36,8 @@ from mmpi_ns.ops.gpu_scene import (
     V_SCALE,
     WIDTH,
     bilinear,
-    is_held,
+    cell,
+    is_stored,
     nearest,
     one_minus_exp,
     row_of,
@@ -210,7 +211,13 @@ def pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K: tl.const
         number = first - done
         _, x, y = _on_plane(constants + mpi * FLOATS, u, bend_u, v, bend_v, number)
         plane = tl.load(grids + mpi * INTS + DEPTH, passes, 0).to(tl.int32) - 1 - number
-        passes = passes & ~is_held(grids, mpi, plane, x, y, passes)
+        # Whether the tables hold any of the four texels around.
+        column, _ = cell(x, tl.load(grids + mpi * INTS + WIDTH))
+        row, _ = cell(y, tl.load(grids + mpi * INTS + HEIGHT))
+        held = is_stored(row_of(grids, mpi, plane, row, column, passes))
+        held = held | is_stored(row_of(grids, mpi, plane, row, column + 1, passes))
+        held = held | is_stored(row_of(grids, mpi, plane, row + 1, column, passes))
+        passes = passes & ~(held | is_stored(row_of(grids, mpi, plane, row + 1, column + 1, passes)))
         done += passes.to(tl.int32)
         passes = passes & (done < count)
     return done

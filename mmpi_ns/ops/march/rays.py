@@ -9,8 +9,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.layout import dense
-
 
 class Rays(NamedTuple):
     """R rays, and the heads that may answer them."""
@@ -27,10 +25,6 @@ class Rays(NamedTuple):
     """Heads that may answer each ray; None for all."""
     priorities: Float[Tensor, "R K"] | None = None
     """Of the MPIs: each ray is answered by the first one of those it meets (and by the cube). None: by all."""
-
-    def dense(self) -> list[Tensor | None]:
-        """The rays as compiled code reads them."""
-        return [*dense(*self[:4]), *dense(self.heads, dtype=torch.bool), *dense(self.priorities)]
 
 
 class MarchOptions(NamedTuple):

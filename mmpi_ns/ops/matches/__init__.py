@@ -6,16 +6,13 @@ is linear in (x, y, 1) (``capture/dense.py``). A match there gives two linear eq
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mmpi_ns.ops.build import run_in_parts
-from mmpi_ns.ops.dispatch import operation
-from mmpi_ns.ops.layout import dense
+from mmpi_ns.ops.dispatch import in_cpp, operation
 
 FAR = -1e4
 """Pixel of a point behind the other image."""
@@ -35,6 +32,13 @@ class Places(NamedTuple):
     """Depth there over depth here; 0 for points behind."""
 
 
+class Moved(NamedTuple):
+    """Values of two maps where pixels have moved to."""
+
+    x: Float[Tensor, "R W"]
+    y: Float[Tensor, "R W"]
+
+
 class Compared(NamedTuple):
     """What another image's depths say of an image's."""
 
@@ -47,8 +51,8 @@ class Compared(NamedTuple):
 class Measured(NamedTuple):
     """Inverse depths with a number that tells how certain they are; both 0 where there is none."""
 
-    inverse: Float[Tensor, "*N"]
-    certainty: Float[Tensor, "*N"]
+    inverse: Float[Tensor, "R W"]
+    certainty: Float[Tensor, "R W"]
     """One over the squared error of a match; the error of a mean."""
 
 
@@ -71,14 +75,17 @@ def place_pixels(
     return Places(x, y, torch.where(behind, 0.0, ahead))
 
 
+in_cpp(place_pixels)
+
+
 @operation()
 def follow_motion(
     x: Float[Tensor, "H W"], y: Float[Tensor, "H W"], motion: Float[Tensor, "R W 2"], first_row: int
-) -> tuple[Float[Tensor, "R W"], Float[Tensor, "R W"]]:
+) -> Moved:
     """Values of two maps at the places that pixels have moved to, interpolated; beyond the borders those of the border.
 
     Args:
-        x, y: the maps, of at least two rows and columns.
+        x, y: the maps.
         motion: right and down, pixels, of some rows.
         first_row: row of the maps with which ``motion`` begins.
     """
@@ -90,20 +97,23 @@ def follow_motion(
     maps = torch.stack([x, y])
     above, below = (torch.lerp(maps[:, row, left], maps[:, row, left + 1], u) for row in (top, top + 1))
     moved_x, moved_y = torch.lerp(above, below, v)
-    return moved_x, moved_y
+    return Moved(moved_x, moved_y)
+
+
+in_cpp(follow_motion)
 
 
 @operation()
 def solve_matches(
-    x: Float[Tensor, "H W"],
-    y: Float[Tensor, "H W"],
-    alike: Float[Tensor, "H W"],
-    usable: Bool[Tensor, "H W"],
+    x: Float[Tensor, "R W"],
+    y: Float[Tensor, "R W"],
+    alike: Float[Tensor, "R W"],
+    usable: Bool[Tensor, "R W"],
     linear: Float[Tensor, "3 3"],
     b: Float[Tensor, "3"],
     first_row: int,
-    noise: float,
-    farthest: float,
+    variance: float,
+    farthest_squared: float,
 ) -> Measured:
     """Inverse depths of matches, by least squares: q = -r.s / s.s.
 
@@ -112,8 +122,8 @@ def solve_matches(
         alike: correlation of the windows about both.
         usable: which matches count.
         linear, b, first_row: as of ``place_pixels``.
-        noise: standard deviation of a match where images look alike, pixels.
-        farthest: largest distance from the epipolar line, pixels.
+        variance: of a match where images look alike, square pixels.
+        farthest_squared: square of the largest distance from the epipolar line, square pixels.
     """
     a = _linear(x, linear, first_row)
     r1, s1 = a[0] - x * a[2], b[0] - x * b[2]
@@ -123,13 +133,18 @@ def solve_matches(
     depth = a[2] + inverse * b[2]
     across = r1 * s2 - r2 * s1  # of r and s, as r + q s is what of r is not along s
     off_line = across * across / (squared * depth * depth)
-    certainty = squared / (depth * depth * (noise**2 + off_line) * (11 - 10 * alike.clamp(max=1)))
-    kept = usable & (depth > LEAST_AHEAD) & (off_line < farthest**2) & inverse.isfinite() & certainty.isfinite()
+    certainty = squared / (depth * depth * (variance + off_line) * (11 - 10 * alike.clamp(max=1)))
+    kept = usable & (depth > LEAST_AHEAD) & (off_line < farthest_squared) & inverse.isfinite() & certainty.isfinite()
     return Measured(torch.where(kept, inverse, 0.0), torch.where(kept, certainty, 0.0))
 
 
+in_cpp(solve_matches)
+
+
 @operation()
-def average_matches(inverse: Float[Tensor, "M P"], certainty: Float[Tensor, "M P"], most_relative: float) -> Measured:
+def average_matches(
+    inverse: Float[Tensor, "M R W"], certainty: Float[Tensor, "M R W"], most_relative: float
+) -> Measured:
     """The mean of the largest consistent subset of the M measurements of each pixel, and its error.
 
     The error is at least the scatter of the subset. A single measurement counts if there is no other.
@@ -157,6 +172,9 @@ def average_matches(inverse: Float[Tensor, "M P"], certainty: Float[Tensor, "M P
         error = torch.where(better, (scatter.clamp(min=1) / total).sqrt(), error)
     kept = (best > 0) & (error < most_relative * mean)
     return Measured(torch.where(kept, mean, 0.0), torch.where(kept, error, 0.0))
+
+
+in_cpp(average_matches)
 
 
 @operation()
@@ -191,59 +209,11 @@ def compare_depths(
     return Compared(both & (apart.abs() < tolerance), both & (apart < -tolerance))
 
 
+in_cpp(compare_depths)
+
+
 def _linear(image: Tensor, linear: Tensor, first_row: int) -> list[Tensor]:
     """The three parts of a at pixels of some rows. [H, W] each"""
     x = torch.arange(image.shape[1], dtype=image.dtype) + 0.5
     y = torch.arange(image.shape[0], dtype=image.dtype)[:, None] + (first_row + 0.5)
     return [m[0] * x + (m[1] * y + m[2]) for m in linear]
-
-
-Maps = TypeVar("Maps", bound=Sequence[Tensor])
-MOST = 16
-"""Measurements of a pixel, as in ``matches.cpp``."""
-
-
-def _written(maps: Maps, name: str, *values: Any) -> Maps:
-    run_in_parts(f"mmpi_{name}", [0, len(maps[0])], *values, *maps)
-    return maps
-
-
-@place_pixels.on_cpu
-def place_pixels_on_cpu(inverse: Tensor, linear: Tensor, b: Tensor, first_row: int) -> Places:
-    places = Places(*torch.empty(3, *inverse.shape))
-    return _written(places, "place_pixels", *dense(inverse, linear, b), inverse.shape[1], first_row)
-
-
-@follow_motion.on_cpu
-def follow_motion_on_cpu(x: Tensor, y: Tensor, motion: Tensor, first_row: int) -> tuple[Tensor, Tensor]:
-    assert min(x.shape) > 1, x.shape
-    moved = (torch.empty(motion.shape[:2]), torch.empty(motion.shape[:2]))
-    return _written(moved, "follow_motion", *dense(x, y, motion), *x.shape, first_row)
-
-
-@solve_matches.on_cpu
-def solve_matches_on_cpu(
-    x: Tensor, y: Tensor, alike: Tensor, usable: Tensor, linear: Tensor, b: Tensor,
-    first_row: int, noise: float, farthest: float,
-) -> Measured:  # fmt: skip
-    arrays = *dense(x, y, alike), *dense(usable, dtype=torch.bool), *dense(linear, b)
-    measured = Measured(*torch.empty(2, *x.shape))
-    return _written(measured, "solve_matches", *arrays, x.shape[1], first_row, noise**2, farthest**2)
-
-
-@average_matches.on_cpu
-def average_matches_on_cpu(inverse: Tensor, certainty: Tensor, most_relative: float) -> Measured:
-    count, pixels = inverse.shape
-    assert count <= MOST, count
-    averaged = Measured(*torch.empty(2, pixels))
-    return _written(averaged, "average_matches", *dense(inverse, certainty), pixels, count, most_relative)
-
-
-@compare_depths.on_cpu
-def compare_depths_on_cpu(
-    inverse: Tensor, error: Tensor, their_inverse: Tensor, their_error: Tensor, linear: Tensor, b: Tensor,
-    first_row: int, same: float,
-) -> Compared:  # fmt: skip
-    arrays = dense(inverse, error, their_inverse, their_error, linear, b)
-    compared = Compared(*torch.empty(2, *inverse.shape, dtype=torch.bool))
-    return _written(compared, "compare_depths", *arrays, inverse.shape[1], *their_inverse.shape, first_row, same)

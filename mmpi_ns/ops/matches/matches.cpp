@@ -6,11 +6,11 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <vector>
 
 namespace {
 
 constexpr float FAR = -1e4f, LEAST_AHEAD = 1e-6f, AGREE = 2.5f; // as in __init__.py
-constexpr int64_t MOST = 16;                                    // measurements of a pixel
 
 // The first `count` of sixteen numbers, the others 0.
 Lanes some(const float* from, int64_t count) {
@@ -43,7 +43,7 @@ struct Linear {
 
 // Rows [begin, end) of pixels at inverse depths: their places, and depths over those here.
 void mmpi_place_pixels(int64_t begin, int64_t end, const float* inverse, const float* linear, const float* b,
-                       int64_t width, int64_t first_row, float* x, float* y, float* ahead) {
+                       int64_t first_row, int64_t, int64_t width, float* x, float* y, float* ahead) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
             const int64_t i = row * width + column, count = width - column;
@@ -58,20 +58,23 @@ void mmpi_place_pixels(int64_t begin, int64_t end, const float* inverse, const f
 }
 
 // Rows [begin, end) of motions: values of two maps at the places moved to, interpolated, at most at the border.
-void mmpi_follow_motion(int64_t begin, int64_t end, const float* x, const float* y, const float* motion, int64_t height,
-                        int64_t width, int64_t first_row, float* moved_x, float* moved_y) {
+void mmpi_follow_motion(int64_t begin, int64_t end, const float* x, const float* y, const float* motion,
+                        int64_t first_row, int64_t height, int64_t width, int64_t, float* moved_x, float* moved_y) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0, i = row * width; column < width; column++, i++) {
             const float right = std::clamp(column + motion[2 * i], 0.0f, width - 1.0f);
             const float down = std::clamp(first_row + row + motion[2 * i + 1], 0.0f, height - 1.0f);
-            const int32_t left = std::min(int32_t(right), int32_t(width - 2));
-            const int32_t top = std::min(int32_t(down), int32_t(height - 2));
+            // Of maps of one row or column, that one.
+            const int32_t left = std::max(0, std::min(int32_t(right), int32_t(width - 2)));
+            const int32_t top = std::max(0, std::min(int32_t(down), int32_t(height - 2)));
             const float u = right - left, v = down - top;
             const int64_t corner = top * width + left;
             const auto at = [&](const float* map) {
                 const float* above = map + corner;
-                const float* below = above + width;
-                const float upper = above[0] + u * (above[1] - above[0]), lower = below[0] + u * (below[1] - below[0]);
+                const float* below = above + (height > 1 ? width : 0);
+                const int64_t next = width > 1;
+                const float upper = above[0] + u * (above[next] - above[0]);
+                const float lower = below[0] + u * (below[next] - below[0]);
                 return upper + v * (lower - upper);
             };
             moved_x[i] = at(x);
@@ -81,8 +84,9 @@ void mmpi_follow_motion(int64_t begin, int64_t end, const float* x, const float*
 
 // Rows [begin, end) of matches at (x, y): inverse depths and one over their squared errors.
 void mmpi_solve_matches(int64_t begin, int64_t end, const float* x, const float* y, const float* alike,
-                        const bool* usable, const float* linear, const float* b, int64_t width, int64_t first_row,
-                        float noise_squared, float farthest_squared, float* inverse, float* certainty) {
+                        const bool* usable, const float* linear, const float* b, int64_t first_row,
+                        float variance, float farthest_squared, int64_t, int64_t width, float* inverse,
+                        float* certainty) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
             const int64_t i = row * width + column, count = width - column;
@@ -93,7 +97,7 @@ void mmpi_solve_matches(int64_t begin, int64_t end, const float* x, const float*
             const Lanes squared = most(s1 * s1 + s2 * s2, splat(1e-20f)), q = -(r1 * s1 + r2 * s2) / squared;
             const Lanes depth = at.a[2] + q * b[2], across = r1 * s2 - r2 * s1;
             const Lanes off_line = across * across / (squared * depth * depth);
-            const Lanes noise = (noise_squared + off_line) * (11 - 10 * least(splat(1), some(alike + i, count)));
+            const Lanes noise = (variance + off_line) * (11 - 10 * least(splat(1), some(alike + i, count)));
             const Lanes sure = squared / (depth * depth * noise);
             const Mask finite = (magnitude(q) < INFINITY) & (magnitude(sure) < INFINITY);
             const Mask near = (depth > LEAST_AHEAD) & (off_line < farthest_squared);
@@ -106,8 +110,8 @@ void mmpi_solve_matches(int64_t begin, int64_t end, const float* x, const float*
 // Rows [begin, end) of depths: whether those of another image confirm or contradict them.
 void mmpi_compare_depths(int64_t begin, int64_t end, const float* inverse, const float* error,
                          const float* their_inverse, const float* their_error, const float* linear, const float* b,
-                         int64_t width, int64_t their_height, int64_t their_width, int64_t first_row, float same,
-                         bool* confirms, bool* contradicts) {
+                         int64_t first_row, float same, int64_t, int64_t width, int64_t their_height,
+                         int64_t their_width, bool* confirms, bool* contradicts) {
     for (int64_t row = begin; row < end; row++) {
         const float down = first_row + row + 0.5f;
         for (int64_t column = 0, i = row * width; column < width; column++, i++) {
@@ -131,12 +135,14 @@ void mmpi_compare_depths(int64_t begin, int64_t end, const float* inverse, const
     }
 }
 
-// Pixels [begin, end): mean of the largest consistent subset of their measurements, which lie `pixels` apart.
-void mmpi_average_matches(int64_t begin, int64_t end, const float* inverse, const float* certainty, int64_t pixels,
-                          int64_t measurements, float most_relative, float* mean, float* error) {
-    for (int64_t p = begin; p < end; p += WIDTH) {
-        const int64_t count = end - p;
-        Lanes q[MOST], weight[MOST], variance[MOST], all{}, measured{}, best{}, average{}, deviation{};
+// Rows [begin, end): mean of the largest consistent subset of each pixel's measurements, which lie `pixels` apart.
+void mmpi_average_matches(int64_t begin, int64_t end, const float* inverse, const float* certainty, float most_relative,
+                          int64_t measurements, int64_t rows, int64_t width, float* mean, float* error) {
+    const int64_t pixels = rows * width;
+    std::vector<Lanes> q(measurements), weight(measurements), variance(measurements);
+    for (int64_t p = begin * width; p < end * width; p += WIDTH) {
+        const int64_t count = end * width - p;
+        Lanes all{}, measured{}, best{}, average{}, deviation{};
         for (int64_t n = 0; n < measurements; n++) {
             q[n] = some(inverse + n * pixels + p, count);
             weight[n] = some(certainty + n * pixels + p, count);

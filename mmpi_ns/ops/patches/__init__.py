@@ -8,15 +8,13 @@ a + q b (``ops/matches``), which are linear in the pixel, too. Planes are judged
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 
-from mmpi_ns.ops.build import even_bounds, run_in_parts
-from mmpi_ns.ops.dispatch import operation
-from mmpi_ns.ops.layout import dense
+from mmpi_ns.ops.dispatch import in_cpp, operation
 
 REACH = 2
 """Pixels of a patch on each side of its middle."""
@@ -77,6 +75,9 @@ def compare_planes(
     return _better(_References(gray, stride), patches, planes, others)
 
 
+in_cpp(compare_planes, least=1)
+
+
 @operation()
 def spread_planes(
     gray: UInt8[Tensor, "H W"],
@@ -110,19 +111,17 @@ def spread_planes(
         patches = _better(references, patches, planes, others)
     factor = torch.exp2(changes[..., :1])
     patches = _better(references, patches, patches.planes * factor, others)
-    return _better(references, patches, _turned(patches.planes / factor, changes[..., 1:], pinhole), others)
-
-
-def _turned(planes: Tensor, turns: Tensor, pinhole: Tensor) -> Tensor:
-    """Planes of the same inverse depths, with something added to their unit normals. [H, W, 3] each"""
-    fx, fy, cx, cy = pinhole
-    x, y = _centers(planes)
-    q, right, down = planes.unbind(-1)
+    (fx, fy, cx, cy), (q, right, down) = pinhole, (patches.planes / factor).unbind(-1)
+    x, y = _centers(before)
     normal = torch.stack([fx * right, fy * down, q - right * (x - cx) - down * (y - cy)], -1)
-    normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-20) + turns
+    normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-20) + changes[..., 1:]
     towards = normal[..., 0] * (x - cx) / fx + normal[..., 1] * (y - cy) / fy + normal[..., 2]
     scale = q / torch.where(towards < 0, towards.clamp(max=-GRAZING), towards.clamp(min=GRAZING))
-    return torch.stack([q, scale * normal[..., 0] / fx, scale * normal[..., 1] / fy], -1)
+    turned = torch.stack([q, scale * normal[..., 0] / fx, scale * normal[..., 1] / fy], -1)
+    return _better(references, patches, turned, others)
+
+
+in_cpp(spread_planes, least=1)
 
 
 def _centers(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -215,26 +214,3 @@ def others_of(
         levels.append([first, *gray.shape])
         first += gray.numel()
     return Others(torch.cat(corners), torch.tensor(levels).view(-1, LEVELS, 3), linear, b)
-
-
-def _run(name: str, gray: Tensor, patches: Patches, others: Others, stride: int, *values: Any) -> Patches:
-    better = Patches(torch.empty_like(patches.planes), torch.empty_like(patches.alike))
-    arrays = *dense(gray, dtype=torch.uint8), *dense(others.corners, dtype=torch.int32)
-    count = len(others.levels)
-    compared = *gray.shape, *arrays, *dense(others.levels, dtype=torch.int64), *dense(others.linear, others.b)
-    run_in_parts(
-        f"mmpi_{name}", even_bounds(len(gray), 1), *compared, count, stride, *dense(*patches), *values, *better
-    )
-    return better
-
-
-@compare_planes.on_cpu
-def compare_planes_on_cpu(gray: Tensor, patches: Patches, planes: Tensor, others: Others, stride: int) -> Patches:
-    return _run("compare_planes", gray, patches, others, stride, *dense(planes))
-
-
-@spread_planes.on_cpu
-def spread_planes_on_cpu(
-    gray: Tensor, patches: Patches, changes: Tensor, pinhole: Tensor, others: Others, stride: int, offset: int
-) -> Patches:
-    return _run("spread_planes", gray, patches, others, stride, *dense(changes, pinhole), offset)

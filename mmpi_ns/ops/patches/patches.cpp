@@ -200,10 +200,10 @@ Plane turned(const Plane& plane, const Plane& turn, Lanes x, float y, const floa
 }
 
 // Rows [begin, end) of an image: the better ones of two planes at each pixel.
-void mmpi_compare_planes(int64_t begin, int64_t end, int64_t height, int64_t width, const uint8_t* gray,
-                         const int32_t* corners, const int64_t* sizes, const float* linear, const float* b, int64_t count,
-                         int64_t stride, const float* planes, const float* alike, const float* others, float* best,
-                         float* best_alike) {
+void mmpi_compare_planes(int64_t begin, int64_t end, const uint8_t* gray, const float* planes, const float* alike,
+                         const float* others, const int32_t* corners, const int64_t* sizes, const float* linear,
+                         const float* b, int64_t stride, int64_t height, int64_t width, int64_t, int64_t count,
+                         float* best, float* best_alike) {
     const Image image{height, width, gray, corners, sizes, linear, b, count, stride};
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
@@ -214,10 +214,10 @@ void mmpi_compare_planes(int64_t begin, int64_t end, int64_t height, int64_t wid
 }
 
 // Rows [begin, end) of an image: the best of each pixel's plane, those around it, and two that differ a little.
-void mmpi_spread_planes(int64_t begin, int64_t end, int64_t height, int64_t width, const uint8_t* gray,
-                        const int32_t* corners, const int64_t* sizes, const float* linear, const float* b, int64_t count,
-                        int64_t stride, const float* planes, const float* alike, const float* changes,
-                        const float* pinhole, int64_t offset, float* best, float* best_alike) {
+void mmpi_spread_planes(int64_t begin, int64_t end, const uint8_t* gray, const float* planes, const float* alike,
+                        const float* changes, const float* pinhole, const int32_t* corners, const int64_t* sizes,
+                        const float* linear, const float* b, int64_t stride, int64_t offset, int64_t height,
+                        int64_t width, int64_t, int64_t count, float* best, float* best_alike) {
     const Image image{height, width, gray, corners, sizes, linear, b, count, stride};
     const int64_t shifts[4][2] = {{-offset, 0}, {offset, 0}, {0, -offset}, {0, offset}};
     for (int64_t row = begin; row < end; row++)

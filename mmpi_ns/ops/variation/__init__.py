@@ -10,23 +10,16 @@ from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
-from mmpi_ns.ops.layout import SceneLayout
-
-Scales = list[tuple[float, float, float]]
+from mmpi_ns.ops.layout import SceneLayout, dense
 
 
-def _check_scales(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> None:
-    if len(scales) != layout.num_heads:
-        raise ValueError(f"scales of {len(scales)} heads where the scene has {layout.num_heads}")
-
-
-@operation("gpu", check=_check_scales)
+@operation("gpu")
 def total_variation(
     values: Float[Tensor, "U C"],
     table: Float[Tensor, "T C"],
     rows: Int[Tensor, "U"],
     layout: SceneLayout,
-    scales: Scales,
+    scales: Float[Tensor, "H 3"],
 ) -> Float[Tensor, ""]:
     """Huber loss of the differences of distinct texels with their stored neighbours in the same head.
 
@@ -41,7 +34,7 @@ def total_variation(
     for grid, each in zip(layout.grids, scales, strict=True):
         inside = grid.holds(rows).nonzero()[:, 0]
         neighbours, exists = grid.neighbours(rows[inside])
-        weights = exists * torch.tensor([s for s in each for _ in range(2)], device=rows.device)
+        weights = exists * each.repeat_interleave(2)
         around = table[neighbours.reshape(-1)].view(*neighbours.shape, -1)
         total = total + clamped_differences(values[inside], around, weights)
     return total
@@ -84,11 +77,10 @@ PART = 4096
 
 
 @total_variation.on_cpu
-def total_variation_on_cpu(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> Tensor:
+def total_variation_on_cpu(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Tensor) -> Tensor:
     gradient, totals = torch.empty_like(values), torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
     inputs = (rows.contiguous(), len(rows), table.shape[1], table, len(table), layout.cpu_grids, layout.num_heads)
-    weights = torch.tensor(scales, dtype=torch.float32)
     outputs = (gradient, totals)
     places = layout.grids[0].places
-    call_in_parts("mmpi_total_variation", len(totals), *inputs, places, weights, *outputs, least=1)
+    call_in_parts("mmpi_total_variation", len(totals), *inputs, places, *dense(scales), *outputs, least=1)
     return WithGradient.apply(values, totals.sum().to(values.dtype), gradient)  # type: ignore[no-any-return]

@@ -10,8 +10,8 @@ import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, grids_of, is_stored, launch, row_of, texel_of
-from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.ops.variation import Scales, WithGradient
+from mmpi_ns.ops.layout import SceneLayout, dense
+from mmpi_ns.ops.variation import WithGradient
 
 ROWS = 128
 """Texels of a program."""
@@ -44,11 +44,10 @@ def variation_kernel(
     tl.store(totals + tl.program_id(0), tl.sum(tl.sum(total, 1), 0))
 
 
-def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> Tensor:
+def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Tensor) -> Tensor:
     (count, channels), device, block = values.shape, values.device, block_size(ROWS, values.device)
-    weights = layout.once(f"scales {scales}", lambda _: torch.tensor(scales, dtype=torch.float32, device=device))
     gradient, totals = torch.empty_like(values), torch.zeros(max(1, triton.cdiv(count, block)), device=device)
-    tensors = (rows.contiguous(), values.contiguous(), table, grids_of(layout), weights, gradient, totals)
+    tensors = (rows.contiguous(), values.contiguous(), table, grids_of(layout), *dense(scales), gradient, totals)
     launch(
         variation_kernel, count, block, *tensors, count, channels, NUM_HEADS=len(scales),
         CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
