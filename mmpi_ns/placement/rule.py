@@ -49,7 +49,7 @@ class PlacementConfig:
     """Planes of every MPI (drive, room)."""
     max_planes: int = 256
     """Maximum planes of an MPI; each gets as many as the points it serves need (automatic)."""
-    plane_pixels: float = 0.5
+    plane_pixels: float = 0.35
     """Plane error allowed for four fifths of the points of an MPI, relative to a texel's pixels (automatic)."""
     texel_pixels: float = 1.5
     """Image pixels that a texel spans, seen from the origin of the MPI (automatic)."""
