@@ -20,7 +20,7 @@ from mmpi_ns.rendering.rendered import RenderedRays
 CLIPPED = 0.98
 """Colour of an image above which a channel may be clipped."""
 PLANE_ERROR = 0.6
-"""Minimum error of a known depth, in plane spacings."""
+"""Minimum error of a known depth, in spacings of the densest planes."""
 TV_EVERY = 4
 """Total variation is added every this many steps, with its weight multiplied by the same number."""
 KEYPOINT_WIDTH = 0.06
@@ -177,9 +177,10 @@ def _depth_sums(rays: RenderedRays, field: MMPIField) -> DepthSums:
     meta, bundle = metadata_of(rays.samples), rays.bundle
     targets = bundle.metadata.get(PIXEL_DEPTH)
     targets = bundle.origins.new_zeros(len(bundle), 2) if targets is None else targets
-    # The plane spacing in inverse distance; a surface between two planes is represented by both.
+    # The spacing of planes in inverse distance: a surface between two is represented by both. Of the densest ones, as
+    # an MPI of few planes may stand at a camera, for which they do.
     spacings = [1 / (m.near * max(1, m.planes - 1)) for m in field.plan.mpis]
-    least = PLANE_ERROR * sum(spacings) / max(1, len(spacings))
+    least = PLANE_ERROR * min(spacings, default=0.0)
     targets = torch.stack([targets[:, 0], (targets[:, 1] ** 2 + least**2).sqrt().clamp(min=1e-12)], -1)
     if KEYPOINT_DEPTH in bundle.metadata:
         keypoints = bundle.metadata[KEYPOINT_DEPTH]
