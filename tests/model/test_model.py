@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -18,6 +19,7 @@ from training_runs import plan_of, ready, trainer_config, write_plan
 import mmpi_ns.model
 from mmpi_ns import model as mmpi_model
 from mmpi_ns.config import mmpi_small
+from mmpi_ns.training import losses
 from mmpi_ns.training.losses import TV_EVERY
 from mmpi_ns.training.phases import TRAINS
 
@@ -86,6 +88,20 @@ def test_total_variation_is_added_every_few_steps_while_densities_train(scene, p
     blend = trainer.pipeline.model.progress.schedule.phases[1].start
     assert [("tv" in run_step(trainer, s)[1]) for s in (0, 1, TV_EVERY)] == [True, False, True]
     assert "tv" not in run_step(trainer, -(-blend // TV_EVERY) * TV_EVERY)[1]
+
+
+def test_the_densest_planes_decide_how_exact_a_known_depth_can_be(scene, tmp_path, monkeypatch):
+    plan = write_plan(scene, tmp_path / "plan.json", num_mpis=2)
+    words = json.loads(plan.read_text())
+    words["mpis"][1]["planes"] = 2
+    plan.write_text(json.dumps(words))
+    targets, sums = [], losses.depth_sums
+    monkeypatch.setattr(losses, "depth_sums", lambda *tensors: targets.append(tensors[4]) or sums(*tensors))
+    run_step(trainer_of(scene, plan, tmp_path, training="joint"), 0)
+    spacing = 1 / (words["mpis"][0]["near"] * (words["mpis"][0]["planes"] - 1))
+    assert spacing < 0.2 / words["mpis"][1]["near"]
+    of_pixels = targets[0][:64, 1]  # keypoints have windows of their own
+    assert of_pixels.min().item() == pytest.approx(0.6 * spacing, rel=1e-2)
 
 
 def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_file, tmp_path):
