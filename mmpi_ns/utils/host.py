@@ -1,7 +1,7 @@
 """Everything that this package changes in its host (nerfstudio, Python, glibc), with the reason and the undo of each.
 
 Nothing happens at import, nor in a program that makes a model, a pipeline or a trainer itself. ``PATCHES`` last for a
-process and are made in nerfstudio's commands and ours alone (``enter_command``); leaving one takes it back. What is
+process and are made in nerfstudio's commands and ours alone (``enter_command``); ``undo`` takes them back. What is
 changed for a block is a context manager below. No other module of the method assigns to what it imports
 (``tests/utils/test_host.py``).
 """
@@ -139,6 +139,12 @@ def enter_command(training: bool = False) -> None:
         if patch not in _entered:
             _entered[patch] = patch()
             _entered[patch].__enter__()
+
+
+def undo() -> None:
+    """Takes all patches back, the last one first."""
+    while _entered:
+        _entered.popitem()[1].__exit__(None, None, None)
 
 
 def give_back_freed_memory() -> None:

@@ -7,8 +7,8 @@ import signal
 import subprocess
 import sys
 import warnings
-from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -49,27 +49,15 @@ def state():
     )
 
 
-def undo():
-    """Takes all patches back, the last one first."""
-    while host._entered:
-        host._entered.popitem()[1].__exit__(None, None, None)
-
-
 @pytest.fixture
 def mallocs(monkeypatch):
     """What malloc is asked to keep, instead of asking it."""
-    undo()  # what another test of this process has left
+    host.undo()  # what another test of this process has left
     asked = []
-
-    @contextmanager
-    def keep():
-        asked.append("kept")
-        yield
-        asked.append("given back")
-
-    monkeypatch.setattr(host, "TRAINING_PATCHES", (keep,))
+    library = SimpleNamespace(mallopt=lambda *setting: asked.append(setting))
+    monkeypatch.setattr(host, "ctypes", SimpleNamespace(CDLL=lambda name: library))
     yield asked
-    undo()
+    host.undo()
 
 
 @pytest.mark.parametrize("training", [False, True])
@@ -79,12 +67,14 @@ def test_every_patch_is_undone(monkeypatch, mallocs, training):
     host.enter_command(training)
     patched = state()
     assert all(a != b for a, b in zip(before[:3], patched[:3], strict=True)), "each of them is made"
-    assert mallocs == (["kept"] if training else [])
+    kept = [(host.TRIM_THRESHOLD, host.KEPT), (host.MMAP_THRESHOLD, host.OWN_MAPPING)]
+    assert mallocs == (kept if training else [])
     host.enter_command(training)
     assert state() == patched, "once"
-    undo()
+    host.undo()
     assert state() == before
-    assert mallocs[1:] == (["given back"] if training else [])
+    given_back = [(number, host.MALLOC_DEFAULT) for number, _ in kept]
+    assert mallocs[2:] == (given_back if training else [])
 
 
 def test_patches_say_what_they_change_and_why():
@@ -185,7 +175,7 @@ def test_scores_of_one_test_image_come_without_a_warning(monkeypatch, mallocs):
         warnings.simplefilter("always")
         host.enter_command()
         assert torch.std_mean(torch.ones(1))[0].isnan() and not shown
-        undo()
+        host.undo()
         torch.std_mean(torch.ones(1))
     assert len(shown) == 1, "torch still warns"
 
