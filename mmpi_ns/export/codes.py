@@ -72,7 +72,7 @@ def coarse_differences(coarse: NDArray[np.uint8]) -> NDArray[np.uint8]:
     the first texels."""
     stored = np.diff(np.diff(coarse, axis=3, prepend=np.uint8(0)), axis=2, prepend=np.uint8(0))
     stored[:, :, 0, 0] = np.diff(stored[:, :, 0, 0], prepend=np.uint8(0))
-    return stored.reshape(*coarse.shape[:2], -1).swapaxes(1, 2)
+    return stored.reshape(*coarse.shape[:2], (SIDE // 2) ** 2).swapaxes(1, 2)
 
 
 def joined_codes(

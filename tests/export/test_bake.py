@@ -327,7 +327,7 @@ def test_baked_codes_are_those_of_the_planes(trainer, monkeypatch, request):
     field._keep(torch.rand(field.num_bricks + 1, generator=g) < 0.6)
     field.density.data[64:][torch.rand(len(field.density) - 64, generator=g) < 0.3] = -20.0
     monkeypatch.setattr(baking, "AT_ONCE_BRICKS", 7)
-    baked, seen = baking.bake(field, 3e-3, 0.5).mpis, 0
+    baked, seen = baking.bake(field, 3e-3, 0.5, False, (1.0, 1.0, 1.0)).mpis, 0
     assert (field.tiles == 0).any() and baked.num_bricks > 50
     for k, numbers in enumerate(brick_numbers(baked.columns, baked.mpis)):
         grid = field.grids[k]

@@ -11,7 +11,7 @@ import torch
 from random_bricks import random_window, scene_of
 
 from mmpi_ns.export.bake import smoothed
-from mmpi_ns.export.codes import smoothed_codes
+from mmpi_ns.export.codes import coarse_differences, smoothed_codes
 from mmpi_ns.export.files import write_baked
 from mmpi_ns.ops.baked import reader
 from mmpi_ns.scene.baked import CELLS, brick_numbers, most_of_copies, neighbours, take_borders
@@ -90,3 +90,8 @@ def test_copies_of_a_texel_have_the_largest_value_of_them(stored):
     agreeing = most.clone()
     take_borders(agreeing, beside)
     assert torch.equal(agreeing, most)
+
+
+def test_a_first_part_without_a_brick_is_empty():
+    """A window of a few bricks has no room for one in its first tenth."""
+    assert coarse_differences(np.zeros((9, 0, 4, 4), np.uint8)).shape == (9, 16, 0)
