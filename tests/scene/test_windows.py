@@ -36,7 +36,7 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     assert most_pixels(few, one) == few.sizes.prod(-1).sum() == most_pixels(few, windows)
     assert 0.05 < most_pixels(many, windows) / many.sizes.prod(-1).sum() < 0.5
     steps = [steps_for("mmpi-small", pixels) for pixels in (1e4, PIXELS, 2 * PIXELS, 1e12)]
-    assert steps == [4000, 4000, 8000, 12000] and steps_for("mmpi", 1.0) == 20000
+    assert steps == [2500, 2500, 5000, 7500] and steps_for("mmpi", 1.0) == 20000
 
 
 @pytest.mark.parametrize(
