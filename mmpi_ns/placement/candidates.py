@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.errors import cube_errors, pixel_slopes
-from mmpi_ns.placement.hand_made import facing_axes, vector
-from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import VisiblePoints, farthest_first
-from mmpi_ns.scene.plan import CubePlan, MPIPlan
+from mmpi_ns.placement.observations import Array, Observations, VisiblePoints, farthest_first
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, Vector
 from mmpi_ns.utils.errors import InputError
 
 MAX_VIEWS, MAX_WIDE_VIEWS = 96, 32
@@ -35,6 +33,24 @@ NEAR_SHARE = 0.6
 """First plane, relative to where points start."""
 CUBE_SIZES = (0.4, 0.7, 1.0)
 """Half a cube's side, relative to the cameras' distance from what they look at."""
+
+
+def vector(v: Array) -> Vector:
+    return (float(v[0]), float(v[1]), float(v[2]))
+
+
+def facing_axes(base: Array, name: str) -> tuple[Vector, Vector, Vector]:
+    """Rows x, y, z of an MPI that faces ``name`` in a frame with rows right, down, forward."""
+    right, down, forward = base
+    x, y, z = {
+        "front": (right, down, forward),
+        "back": (-right, down, -forward),
+        "left": (forward, down, -right),
+        "right": (-forward, down, right),
+        "below": (right, -forward, down),
+        "above": (right, forward, -down),
+    }[name]
+    return vector(x), vector(y), vector(z)
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.observations import Array, Observations, farthest_first, find_visible_points
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import farthest_first, find_visible_points
 from mmpi_ns.scene.windows import Window, WindowedPlan
 
 MARGIN = 0.08
