@@ -98,14 +98,11 @@ class Exposure:
 
 
 def make_exposure(name: ExposureName, scene: Scene) -> Exposure | None:
-    """Exposures of a scene's images.
+    """Exposures of a scene's images, taken in the order of its cameras.
 
-    Args:
-        name: none: one exposure, pixel values are the scene's colours. auto: gains follow what an image sees, a few
-            images late, three-fold between the darkest and the brightest; white balance wanders by a tenth.
-            vignetting: one exposure, half of the light lost in the corners.
-        scene: with its cameras in the order in which they took the images.
-    """
+    none: one exposure, pixel values are the scene's colours. auto: gains follow what an image sees, a few images late,
+    three-fold between the darkest and the brightest; white balance wanders by a tenth. vignetting: one exposure, half
+    of the light lost in the corners."""
     if name == "none":
         return None
     count, log_gains = len(scene.cameras), np.zeros((len(scene.cameras), 3))
@@ -195,14 +192,8 @@ def _write_image(scene: Scene, folder: Path, exposure: Exposure | None, camera: 
 
 
 def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> None:
-    """Writes the depth image of a camera: millimetres along the optical axis, 0 where that is too far.
-
-    Args:
-        scene: whose cameras these are.
-        folder: of the data set.
-        camera: number of the camera.
-        distances: along the rays [H, W], metres.
-    """
+    """Writes the depth image of a camera, given metres along the rays [H, W]: millimetres along the optical axis, 0
+    where that is too far."""
     slant = np.sqrt(1 + (scene.cameras.central_tangents**2).sum(-1)).reshape(distances.shape)
     depths = 1000 * distances / slant
     millimetres = np.where(depths <= MILLIMETRES, depths, 0).round().astype(np.uint16)

@@ -114,13 +114,8 @@ class Tracer:
     def __call__(
         self, origins: Array, directions: Array, limit: float | None = None
     ) -> tuple[Array, NDArray[np.int64]]:
-        """Distance [R] to the first solid within reach (inf for none) and its row (-1).
-
-        Args:
-            origins: [R, 3]
-            directions: [R, 3] unit vectors.
-            limit: distance beyond which hits do not count, if less than the reach.
-        """
+        """Distance [R] to the first solid within reach, or ``limit`` if less (inf for none) and its row (-1), for rays
+        from origins [R, 3] in unit directions [R, 3]."""
         distance, row = np.full(len(directions), np.inf), np.full(len(directions), -1)
         if not len(directions) or not len(self.primitives):
             return distance, row
@@ -183,12 +178,8 @@ class Tracer:
 
 
 def box_distance(origins: Array, directions: Array, center: Array, half: Array, yaw: Array) -> Array:
-    """Distance [R] at which rays enter a box, each its own, inf where they miss it or start inside.
-
-    Args:
-        origins, directions: of the rays. [R, 3]
-        center, half, yaw: of the boxes, as in ``Primitives``; [R, 3], [R, 3] and [R].
-    """
+    """Distance [R] at which rays [R, 3] enter a box, each its own (as in ``Primitives``: [R, 3], [R, 3] and [R]), inf
+    where they miss it or start inside."""
     o, d = (origins - center).T, directions.T
     c, sn = np.cos(yaw), np.sin(yaw)
     enter, leave = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)

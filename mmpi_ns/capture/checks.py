@@ -64,16 +64,11 @@ STRETCH = 10.0
 
 
 def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Sequence[str], *, opens: bool) -> None:
-    """Reads a transforms.json and checks everything that nerfstudio's parser takes from it.
+    """Reads a transforms.json (in a folder, or a file of another name) and checks everything that nerfstudio's parser
+    takes from it, for the ``splits`` of train, val and test that will be requested.
 
-    Args:
-        parser: its settings.
-        data: folder with a transforms.json, or a file of that kind.
-        splits: those of train, val and test that will be requested.
-        opens: the parser takes its downscale factor from the first image, unless one is given, or from its copies.
-
-    Raises:
-        InputError: one sentence with the file, the frame if it is of one, and what to do.
+    Where it ``opens`` images, it takes its downscale factor from the first, unless one is given, or from its copies.
+    Raises InputError: one sentence with the file, the frame if it is of one, and what to do.
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
     meta, frames = _read(path)
@@ -236,18 +231,8 @@ def _check_whole_file(
 def check_places(
     centers: NDArray[np.float64], names: Sequence[str], path: Path, parser: str, *, auto_scale: bool
 ) -> None:
-    """Camera positions [M, 3] in a file must differ, and none may be far from all others.
-
-    Args:
-        centers: the positions.
-        names: of the images.
-        path: the file or model, for the sentence.
-        parser: name of the data parser on the command line.
-        auto_scale: the parser divides by their extent.
-
-    Raises:
-        InputError: they do not.
-    """
+    """Raises InputError unless camera positions [M, 3] in a file or model differ, if the parser, by its name on the
+    command line, divides by their extent, and none is far from all others."""
     if np.ptp(centers, axis=0).max() <= FLOAT64_SAME * max(1.0, np.abs(centers).max()):
         if not auto_scale:
             return

@@ -208,11 +208,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return None if ratios is None else image_gains(ratios, len(posed.files), light)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
-        """Draws from these training cameras from now on, None for all, and prints the share of each source.
-
-        Raises:
-            InputError: an image cannot be used, or the masks leave no pixel.
-        """
+        """Draws from these training cameras from now on, None for all, and prints the share of each source. Raises
+        InputError if an image cannot be used, or the masks leave no pixel."""
         if self._resident is None:
             self.sources = None  # before the next pixels are read
             self.sources = self._read_sources(cameras)
@@ -336,7 +333,8 @@ def check_there(data: Path) -> None:
 def load_observations(
     data: Path, downscale_factor: int | None = None, parser: Parser = "auto", moving: Path | None = None
 ) -> tuple[Observations, str]:
-    """The observations that training on a scene would use, and a sentence on what moves in its images.
+    """The observations that training on a scene would use, and a sentence on what moves in its images. Raises
+    InputError if the folder holds no scene, or one that cannot be trained.
 
     Args:
         data: the scene's folder.
@@ -344,9 +342,6 @@ def load_observations(
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
         moving: file for a picture of what moves. None: neither movers nor depths of pixels are searched, which takes
             minutes; tracks or a plane sweep take their place.
-
-    Raises:
-        InputError: the folder holds no scene, or one that cannot be trained.
     """
     check_there(data)
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))

@@ -179,11 +179,8 @@ def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
     """Depths of a sensor along the optical axis [h, w], scene units; 0 where unknown.
 
     Args:
-        file: 16-bit PNG or .npy (nerfstudio's depth_file_path).
+        file: 16-bit PNG or .npy (nerfstudio's depth_file_path); InputError names one that holds something else.
         unit: scene units of a depth of 1 (nerfstudio's depth_unit_scale_factor).
-
-    Raises:
-        InputError: the file cannot be read or holds something else (names it).
     """
     try:
         is_array = file.suffix == ".npy"
@@ -382,17 +379,9 @@ def _points_or_none(*how: Any) -> dict[str, Tensor] | None:
 def parser_points(
     path: Path, transform_matrix: Tensor, scale_factor: float, origin: NDArray[np.float64] | float = 0.0
 ) -> dict[str, Tensor] | None:
-    """A point cloud as nerfstudio's data parser returns it; None if it holds no point.
-
-    Args:
-        path: PLY file.
-        transform_matrix: [3, 4], from the file's axes to the scene's.
-        scale_factor: of the scene.
-        origin: taken off the points before they are rounded to float32.
-
-    Raises:
-        InputError: it is no PLY file of points.
-    """
+    """The point cloud of a PLY file, moved to the scene's axes [3, 4] and scaled, as nerfstudio's data parser returns
+    it; None if it holds no point. ``origin`` is taken off before points are rounded to float32. Raises InputError if it
+    is no PLY file of points."""
     from plyfile import PlyData, PlyParseError  # slow to import; comes with nerfstudio's viewer
 
     try:

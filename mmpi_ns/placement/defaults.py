@@ -59,35 +59,21 @@ FACES = ("front", "left", "right", "below")
 
 
 def rays_times(method: str, processors: int) -> int:
-    """How many times its rays a method draws in a step, in as many times fewer steps; a power of two.
-
-    Args:
-        method: with defaults.
-        processors: multiprocessors of the GPU; 0 on a CPU.
-    """
+    """How many times its rays a method with defaults draws in a step, in as many times fewer steps; a power of two.
+    ``processors`` are the multiprocessors of the GPU, 0 on a CPU."""
     fit = RAYS_PER_PROCESSOR * processors // DEFAULTS[method].rays
     return min(1 << max(fit, 1).bit_length() - 1, MOST_RAYS_TIMES)
 
 
 def steps_for(method: str, pixels: float, times: int = 1) -> int:
-    """Training steps of a window, in hundreds: more for captures of many pixels, in proportion.
-
-    Args:
-        method: with defaults.
-        pixels: training pixels of the window.
-        times: how many times the method's rays a step draws (``rays_times``).
-    """
+    """Training steps of a window, in hundreds: more for many training pixels, in proportion; fewer if a step draws
+    several times the method's rays (``rays_times``)."""
     multiple = min(max(1.0, pixels / PIXELS), MOST_TIMES)
     return 100 * round(DEFAULTS[method].steps * multiple / 100) // times
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:
-    """Raises InputError naming the option whose value cannot be used.
-
-    Args:
-        config: the rule's settings.
-        prefix: of the options on the command line, "--placement." for example.
-    """
+    """Raises InputError naming the option, with its prefix on the command line, whose value cannot be used."""
     check_options(config, RANGES, prefix)
     if not config.faces or not set(config.faces) <= set(FACES):
         raise InputError(f"{prefix}faces must be some of {', '.join(FACES)}, not {shown(config.faces)}.")

@@ -146,12 +146,8 @@ class Observations:
         return depths
 
     def directions(self, camera: int, shares: Array) -> Array:
-        """Directions [N, 3], in camera axes and of depth 1, through places [N, 2] of an image.
-
-        Args:
-            camera: number of the camera.
-            shares: x and y as shares of the image's sides; a little beyond the borders will do.
-        """
+        """Directions [N, 3], in axes of a camera and of depth 1, through places [N, 2] of its image: x and y as shares
+        of the image's sides; a little beyond the borders will do."""
         if self.lens is None:
             (fx, fy, cx, cy), (w, h) = self.intrinsics[camera], self.sizes[camera]
             x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
@@ -213,10 +209,7 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     """The observations that placement weighs: keypoints, and points that fill the cameras' frusta.
 
     Keypoints that are not finite or lie behind their camera are left out. Without any the nearest point is taken to lie
-    at a tenth of the cameras' spread.
-
-    Raises:
-        InputError: there are keypoints, and none of them can be used.
+    at a tenth of the cameras' spread. Raises InputError if there are keypoints, and none of them can be used.
     """
     centers = observations.centers
     cameras, points = observations.seen_by, observations.points[observations.seen_point]
@@ -279,12 +272,8 @@ def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> floa
 def farthest_first(places: Array, count: int | None = None, radius: float = 0.0) -> list[int]:
     """Places far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
 
-    Starts at the place farthest from the middle, so the numbering does not matter.
-
-    Args:
-        places: [M, D]
-        count: number of places; None: as many as it takes until balls of ``radius`` around them contain all.
-        radius: of the balls.
+    Starts at the place farthest from the middle, so the numbering does not matter. Without a count, as many of the
+    places [M, D] as it takes until balls of ``radius`` around them contain all.
     """
     chosen = [int(np.linalg.norm(places - places.mean(0), axis=-1).argmax())]
     distance = np.linalg.norm(places - places[chosen[0]], axis=-1)

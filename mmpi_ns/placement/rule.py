@@ -81,16 +81,8 @@ class PlacementConfig:
 
 
 def place(observations: Observations, config: PlacementConfig, training_rays: int | None = None) -> ScenePlan:
-    """The scene plan for some training cameras and what they saw.
-
-    Args:
-        observations: training cameras and points.
-        config: the rule's settings.
-        training_rays: pixel rays of the whole training, if known: texels are no finer than these can train.
-
-    Raises:
-        ValueError: the cameras leave nothing to place, e.g. all observations are behind their cameras.
-    """
+    """The scene plan for some training cameras and what they saw. Texels are no finer than the pixel rays of the whole
+    training can train, if known. Raises ValueError if all observations are behind their cameras."""
     visible = find_visible_points(observations)
     if config.arrangement != "automatic":
         arrange = _drive if config.arrangement == "drive" else _room
@@ -284,11 +276,6 @@ def widened(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoi
 
     A border is tested at the depths between which the image's points lie. Each border point outside all MPIs is
     assigned to the MPI that must grow least for it.
-
-    Args:
-        mpis: the chosen MPIs.
-        observations: the training cameras.
-        visible: points that they see.
     """
     points = border_points(observations, visible)
     origins = np.array([m.origin for m in mpis], dtype=np.float64)

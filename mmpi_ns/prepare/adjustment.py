@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mmpi_ns.capture.matching import MIN_ANGLE, quiet, triangulate_points
+from mmpi_ns.capture.sfm import MIN_ANGLE, quiet, triangulate_points
 from mmpi_ns.prepare.alignment import camera_poses, degrees_between, similarity_between
 from mmpi_ns.prepare.features import matched_keypoints
 from mmpi_ns.utils.errors import InputError, progress, say
@@ -53,15 +53,8 @@ class Free:
 def adjust(
     model: pycolmap.Reconstruction, threads: int, lens: bool, principal_point: bool = False, poses: bool = True
 ) -> None:
-    """Bundle adjustment over all images with a robust loss, in place.
-
-    Args:
-        model: adjusted; its points always are.
-        threads: CPU threads; below 1 for all.
-        lens: refine focal length and distortion.
-        principal_point: refine the principal point.
-        poses: refine poses.
-    """
+    """Bundle adjustment of points, and of what is named, over all images with a robust loss, in place; ``lens`` is
+    focal length and distortion."""
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
     options.refine_rig_from_world = poses
     options.refine_focal_length = options.refine_extra_params = lens
@@ -83,11 +76,6 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
     """The model adjusted with more parameters free, if that lowers the error.
 
     Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point.
-
-    Args:
-        model: adjusted; not changed.
-        free: what may be refined.
-        threads: CPU threads; below 1 for all.
     """
     trials = []  # in words, and whether it is the four lens terms; else the principal point
     if free.principal_point:
@@ -97,37 +85,31 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
     if not trials:
         return model
     center = four_terms = False
+
+    def adjusted(start: pycolmap.Reconstruction, four_terms: bool, center: bool) -> pycolmap.Reconstruction:
+        """A copy adjusted with cameras of one radial term as OpenCV's, if asked, and the principal point free."""
+        trial = copy.deepcopy(start)
+        for camera in trial.cameras.values() if four_terms else ():
+            if camera.model.name == "SIMPLE_RADIAL":
+                f, cx, cy, k = camera.params
+                camera.model = pycolmap.CameraModelId.OPENCV
+                camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+        adjust(trial, threads, free.lens, center)
+        return trial
+
     with progress("Fitting the lens", 1 + len(trials)) as advance:
         light = with_fewer_points(model)
         adjust(light, threads, free.lens)
         advance()
         for says, is_lens in trials:
-            trial = copy.deepcopy(light)
-            if is_lens:
-                _give_four_terms(trial)
-            adjust(trial, threads, free.lens, center or not is_lens)
+            trial = adjusted(light, is_lens, center or not is_lens)
             advance()
             before, after = rms_error(light), rms_error(trial)
             is_better = after < WORTH * before
             say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {'kept' if is_better else 'not kept'}.")
             if is_better:
                 light, center, four_terms = trial, center or not is_lens, four_terms or is_lens
-    if not center and not four_terms:
-        return model
-    best = copy.deepcopy(model)
-    if four_terms:
-        _give_four_terms(best)
-    adjust(best, threads, free.lens, center)
-    return best
-
-
-def _give_four_terms(model: pycolmap.Reconstruction) -> None:
-    """Cameras of one radial term become OpenCV's, with the others at zero."""
-    for camera in model.cameras.values():
-        if camera.model.name == "SIMPLE_RADIAL":
-            f, cx, cy, k = camera.params
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+    return adjusted(model, four_terms, center) if center or four_terms else model
 
 
 def rms_error(model: pycolmap.Reconstruction) -> float:
@@ -188,10 +170,6 @@ def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float,
 
     Principal point in the middle; principal point free; each half of the images alone. The statistical error of one
     adjustment is far smaller and means little, because the assumptions dominate. Of several cameras, the first.
-
-    Args:
-        model: not changed.
-        threads: CPU threads; below 1 for all.
     """
     light, ids = with_fewer_points(model), sorted(model.reg_image_ids())
     middle = len(ids) // 2
@@ -216,21 +194,9 @@ def focal_in_words(low: float, high: float) -> str:
 def map_known_poses(
     model: pycolmap.Reconstruction, database: Path, images: Path, refine_poses: bool, refine_lens: bool, threads: int
 ) -> tuple[pycolmap.Reconstruction, str]:
-    """Triangulates points from the poses of a model, and refines these.
+    """Triangulates points from the poses of a model, and refines these, aligned with the given scale and frame.
 
-    Args:
-        model: cameras and posed images without points; changed in place.
-        database: features and matches.
-        images: folder of the images.
-        refine_poses: bundle-adjust poses; the result is aligned with the given scale and frame.
-        refine_lens: bundle-adjust intrinsics as well.
-        threads: CPU threads; below 1 for all.
-
-    Returns:
-        The model with points, and what was done in words.
-
-    Raises:
-        InputError: the poses do not fit the matches.
+    Returns the model with points, and what was done in words. Raises InputError if the poses do not fit the matches.
     """
     _, before = camera_poses(model)
     refines = refine_poses or refine_lens

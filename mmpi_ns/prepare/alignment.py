@@ -67,18 +67,10 @@ def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
 
 
 def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
-    """The plane that the cameras stand over: the most populous among roughly level ones, by RANSAC.
+    """The plane that the cameras [N, 3] stand over: the most populous of SfM points [P, 3] among roughly level ones.
 
-    Args:
-        points: SfM points. [P, 3]
-        centers: camera centres. [N, 3]
-        up: rough up. [3]
-
-    Returns:
-        Unit normal towards the cameras [3], and the cameras' median height above the plane.
-
-    Raises:
-        InputError: too few points below the cameras, or no plane among them.
+    Returns its unit normal towards the cameras [3], and their median height above it. Raises InputError if too few
+    points lie below the cameras, or no plane is among them.
     """
     # Points below the nearest camera and near the track.
     some = centers[:: max(1, len(centers) // 32)]
@@ -113,14 +105,9 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
     """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
 
     Without a ground, cameras are assumed level: up is perpendicular to all right vectors if they turn, else the mean up
-    vector.
+    vector. Without ``camera_height``, in metres above the ground, one unit is the extent of the track.
 
-    Args:
-        model: in its own frame.
-        camera_height: metres above the ground, or None: then one unit is the extent of the track.
-
-    Returns:
-        The transform from the model to the scene, and the sources of up and of the unit in words.
+    Returns the transform from the model to the scene, and the sources of up and of the unit in words.
     """
     _, poses = camera_poses(model)
     centers = poses[:, :3, 3]

@@ -20,7 +20,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.matching import MIN_INLIERS, epipolar_distances, verified_matches
+from mmpi_ns.capture.sfm import MIN_INLIERS, epipolar_distances, verified_matches
 from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between, rotation_between, similarity_between
 
 Places = NDArray[np.int64]
@@ -98,15 +98,8 @@ class Agreement:
 
 
 def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
-    """The evidence on a mapper's model.
-
-    Args:
-        name: of the mapper.
-        says: how it made the model, in words.
-        model: poses and points, with the keypoints of the database.
-        database: verified matches.
-        offered: names of all images of the capture, in order.
-    """
+    """The evidence on a mapper's model, which has the keypoints of the database; ``offered`` are the names of all
+    images of the capture in order."""
     names, poses = camera_poses(model)
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
     points = {  # the point that each keypoint sees, -1 for none
@@ -164,16 +157,12 @@ def share(part: Array, whole: Array) -> float:
 
 
 def bridges(pairs: Pairs, count: int, part: Array, whole: Array | None = None) -> Array:
-    """Fraction of the matches across each gap between two registered images that hold.
+    """Fraction of the matches across each gap between two of N registered images that hold, NaN for few. [N - 1]
 
     Args:
-        pairs: of the model.
-        count: registered images, N.
+        pairs, count: of the model; N.
         part: ``pairs.tracked`` or ``pairs.fitting``. [P]
         whole: what it is a part of; all matches unless given. [P]
-
-    Returns:
-        Fractions; NaN if there are too few matches across. [N - 1]
     """
     near = pairs.second - pairs.first <= REACH
     first, second = pairs.first[near], pairs.second[near]
@@ -252,12 +241,8 @@ def local_median(values: Array, reach: int) -> Array:
 
 
 def strides(witness: Witness) -> tuple[Array, Array]:
-    """How even the steps from frame to frame are; a step over missing frames is divided among them.
-
-    Returns:
-        Length of each step relative to the median of the steps around it [N - 1]; ratio, at least 1, of the median
-        steps after and before each frame, 1 near the ends, where there are few [N].
-    """
+    """Length of each step, divided among missing frames, relative to the median of the steps around it [N - 1]; ratio,
+    at least 1, of the median steps after and before each frame, 1 near the ends, where there are few [N]."""
     lengths = np.linalg.norm(np.diff(witness.poses[:, :3, 3], axis=0), axis=-1) / np.maximum(np.diff(witness.places), 1)
     usual = float(np.median(lengths)) if len(lengths) else 0.0
     jumps = lengths / np.maximum(local_median(lengths, WINDOW) + 0.05 * usual, 1e-12)

@@ -15,9 +15,10 @@ import pycolmap
 from PIL import Image
 
 from mmpi_ns.capture.exif import kept_tags
-from mmpi_ns.capture.matching import quiet
+from mmpi_ns.capture.sfm import quiet
 from mmpi_ns.prepare.alignment import camera_poses
-from mmpi_ns.prepare.images import Photo, read_intrinsics
+from mmpi_ns.prepare.images import QUALITY, Photo
+from mmpi_ns.prepare.poses import read_intrinsics
 from mmpi_ns.utils.errors import InputError, progress
 from mmpi_ns.utils.files import whole, write_text
 
@@ -25,8 +26,6 @@ IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 """Written explicitly: without it, nerfstudio-data assumes an axis swap if colmap/sparse/0 exists."""
 PART = re.compile(r"(images|masks)(_\d+)?|colmap|sparse_pc\.ply|report\.md|report|transforms\.json")
 """The parts of a scene."""
-QUALITY = 97
-"""Of JPEG."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +138,11 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
             small = Image.fromarray(blocks.min((1, 3)))
         else:
             small = image.reduce(factor)
+    kind = "PNG" if target.suffix.lower() == ".png" else "JPEG"
+    if kind == "JPEG" and small.mode != "L":
+        small = small.convert("RGB")
     with whole(target) as partial:
-        if target.suffix.lower() == ".png":
-            small.save(partial, format="PNG", exif=tags)
-        else:
-            small = small.convert("L" if small.mode == "L" else "RGB")
-            small.save(partial, format="JPEG", quality=QUALITY, subsampling=0, exif=tags)
+        small.save(partial, format=kind, quality=QUALITY, subsampling=0, exif=tags)
 
 
 def write_scene(model: pycolmap.Reconstruction, scene: Path, content: dict[str, Any]) -> None:
@@ -180,18 +178,9 @@ def undistort(
     target: Path,
     threads: int,
 ) -> tuple[pycolmap.Reconstruction, list[Photo]]:
-    """Writes undistorted images, with their EXIF, and masks.
+    """Writes undistorted images, with their EXIF, and masks (``NAME.png``) to folders of these names in ``target``.
 
-    Args:
-        model: not changed.
-        photos: registered images.
-        images: folder of the images.
-        masks: folder of the masks (``NAME.png``), or None.
-        target: gets ``images`` and ``masks``.
-        threads: CPU threads; below 1 for all.
-
-    Returns:
-        The model with pinhole cameras and moved keypoints, and the images with their new sizes.
+    Returns the model with pinhole cameras and moved keypoints, and the registered photos with their new sizes.
     """
     (target / "bent").mkdir(parents=True)
     model.write(target / "bent")
@@ -204,6 +193,13 @@ def undistort(
     flat = pycolmap.Reconstruction(target / "sparse")
     flat.update_point_3d_errors()
     camera_of = {image.name: image.camera_id for image in model.images.values()}
+
+    def flattened(mask: Image.Image, camera: int) -> Image.Image:
+        bitmap = pycolmap.Bitmap.from_array(np.asarray(mask))
+        return Image.fromarray(
+            pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, model.cameras[camera])[0].to_array()
+        )
+
     flat_photos = []
     for photo in photos:
         number = camera_of[photo.name]
@@ -212,19 +208,13 @@ def undistort(
         if alpha is not None:  # COLMAP reads colours alone
             with Image.open(target / "images" / photo.name) as image:
                 tags = image.getexif()
-                image.putalpha(_undistort_mask(alpha, model.cameras[number]))
+                image.putalpha(flattened(alpha, number))
             image.save(target / "images" / photo.name, exif=tags)
         if masks is not None:
             (target / "masks").mkdir(exist_ok=True)
             with Image.open(masks / f"{photo.name}.png") as mask:
-                flat_mask = _undistort_mask(mask, model.cameras[number]).point(lambda v: 255 if v == 255 else 0)
+                flat_mask = flattened(mask, number).point(lambda v: 255 if v == 255 else 0)
             flat_mask.save(target / "masks" / f"{photo.name}.png")
         size = flat.cameras[number]
         flat_photos.append(replace(photo, width=size.width, height=size.height, exif_focal=None))
     return flat, flat_photos
-
-
-def _undistort_mask(mask: Image.Image, camera: pycolmap.Camera) -> Image.Image:
-    bitmap = pycolmap.Bitmap.from_array(np.asarray(mask))
-    flat, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, camera)
-    return Image.fromarray(flat.to_array())

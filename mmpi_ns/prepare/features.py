@@ -19,7 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
-from mmpi_ns.capture.matching import (
+from mmpi_ns.capture.sfm import (
     MIN_INLIERS,
     count_features,
     find_features,
@@ -117,11 +117,8 @@ def extract(
 
 
 def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:
-    """Matches and verifies pairs of images (indices into ``photos``); pairs matched before are skipped.
-
-    Returns:
-        Pairs with verified matches.
-    """
+    """Matches and verifies pairs of images (indices into ``photos``), but for those matched before; returns the number
+    of pairs with verified matches."""
     with progress("Matching pairs", len(pairs)) as advance, quiet():
         for start in range(0, len(pairs), PAIR_BATCH):
             batch = pairs[start : start + PAIR_BATCH]

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pycolmap
 
-from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet
+from mmpi_ns.capture.sfm import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.adjustment import STILL, Free, is_bent, polish, quality, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.features import matching_pairs
@@ -112,13 +112,8 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
     An attempt continues the best model of the earlier ones if that is sound and contains the fraction ``CARRIES`` of
     the images: often it stopped at one stretch with few matches, and the rest need not be computed again.
 
-    Args:
-        task: what is to be mapped.
-        database: features, verified matches and the cameras to start from.
-        attempts: maximum number of attempts.
-
-    Raises:
-        InputError: no attempt found an initial pair.
+    Raises InputError if no attempt, of ``attempts`` at most, finds an initial pair in the database, whose cameras it
+    starts from.
     """
     total, pairs = len(task.offered), len(matching_pairs(database))
     if not pairs:
@@ -231,11 +226,10 @@ def map_globally(
     Every random draw is seeded, small angles are kept, and given intrinsics left alone.
 
     Args:
-        task: what is to be mapped.
+        task, threads: what is to be mapped, and CPU threads.
         name: of the start: its folder gets the models.
         focals: focal lengths to start from, in pixels by camera id; the others are those of the database.
         names: the images to place.
-        threads: CPU threads.
     """
     folder, folders, refine = task.work / name, task.work / name / "models", task.free.lens
     if not (folder / "done").exists():
@@ -268,11 +262,7 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
 
     The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse.
 
-    Returns:
-        Poses and points, the mappers in words, and how far they can be believed.
-
-    Raises:
-        InputError: neither mapper makes a model.
+    Returns it, the mappers in words, and how far it can be believed. Raises InputError if neither mapper makes a model.
     """
     chosen, *others = _candidates(task)
     with progress("Adding points", 1) as advance:

@@ -15,7 +15,8 @@ from rich.progress import track
 from mmpi_ns.capture.moving import draw_moving, find_moving, in_image
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import straightened_color
-from mmpi_ns.prepare.images import Photo, read_intrinsics
+from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.poses import read_intrinsics
 
 
 def write_masks(
@@ -27,19 +28,10 @@ def write_masks(
     picture: Path,
     threads: int,
 ) -> dict[str, float]:
-    """Finds what moves in the training images; where anything does, writes a mask for each photo and a picture.
+    """Finds what moves in the training images, which alone are compared; where anything does, writes a mask for each
+    photo, ``target/NAME.png``, white where used and of test images, and a picture.
 
-    Args:
-        model: poses, cameras and points.
-        photos: all that get a mask, ``target/NAME.png``: white is used. Those of test images are white.
-        train: names of the training images, which alone are compared.
-        images: folder of the images.
-        target: folder for the masks.
-        picture: file for the picture.
-        threads: processor threads; below 1 for all.
-
-    Returns:
-        The share that is masked of each image in which something moves, by name.
+    Returns the share that is masked of each image in which something moves, by name.
     """
     if threads > 0:
         torch.set_num_threads(threads)

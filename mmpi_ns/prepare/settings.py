@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from mmpi_ns.prepare.features import Matching
-from mmpi_ns.prepare.images import Lens, Sharing
+from mmpi_ns.prepare.poses import Lens, Sharing
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import Number, check_options
 

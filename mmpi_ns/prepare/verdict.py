@@ -79,12 +79,7 @@ def worse(value: float, limits: tuple[float, float]) -> Grade:
 
 
 def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
-    """The verdict on a mapper's model by its own evidence.
-
-    Args:
-        witness: of the mapper.
-        is_sequence: the images are in the order of the drive or walk.
-    """
+    """The verdict on a mapper's model by its own evidence; a sequence has its images in the order of the motion."""
     pairs, count = witness.pairs, len(witness.images)
     tracked, fitting = share(pairs.tracked, pairs.matches), share(pairs.fitting, pairs.fitting + pairs.beside)
     problems: list[tuple[Grade, str]] = [

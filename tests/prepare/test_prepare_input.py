@@ -15,19 +15,20 @@ from mmpi_ns.prepare import checks, export, features
 from mmpi_ns.prepare.checks import exposure_in_words
 from mmpi_ns.prepare.images import (
     Photo,
+    choose_frames,
     find_images,
     gather,
     gather_masks,
-    make_cameras,
+    measure,
     open_image,
-    parse_camera,
-    read_intrinsics,
     reads_heif,
     scene_names,
+    select_frames,
+    sharpness,
 )
 from mmpi_ns.prepare.pipeline import prepare
+from mmpi_ns.prepare.poses import make_cameras, parse_camera, read_intrinsics
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.video import choose_frames, measure, select_frames
 from mmpi_ns.utils.errors import InputError
 
 
@@ -386,5 +387,5 @@ def test_jump_and_turn_of_the_track_are_found():
 def test_blurred_image_is_found():
     images = [cv2.cvtColor(corridor.picture(p), cv2.COLOR_RGB2GRAY) for p in corridor.poses(6)]
     images[3] = cv2.GaussianBlur(images[3], (0, 0), 2)
-    sharp = np.array([checks.sharpness(i) for i in images])
+    sharp = np.array([sharpness(i) for i in images])
     assert [f.image for f in checks.blurred(list("abcdef"), sharp, True)] == ["d"]

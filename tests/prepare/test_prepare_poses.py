@@ -9,9 +9,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mmpi_ns.prepare.images import Intrinsics, Photo
+from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.poses import read_poses
+from mmpi_ns.prepare.poses import Intrinsics, read_poses
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.utils.errors import InputError
 
