@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 from typing import Any, Literal
@@ -77,13 +76,6 @@ class Exposure:
         offset = (cameras.pixel_centers - cameras.center) / np.hypot(*cameras.center)
         passed = (1 - self.vignetting * (offset**2).sum(-1)).reshape(cameras.height, cameras.width, 1)
         return tone(np.minimum(1, self.gains[camera] * passed * light_of(colors))).astype(np.float32)
-
-    def exif(self, camera: int) -> Image.Exif:
-        """EXIF of an image: the gain of green is its exposure time."""
-        exif = Image.Exif()
-        seconds = Fraction(SECONDS * self.gains[camera, 1]).limit_denominator(10**6)
-        exif[0x8769] = {33434: float(seconds), 33437: APERTURE, 34855: SPEED}  # its own directory: time, f-number, ISO
-        return exif
 
     def to_object(self, names: list[str]) -> dict[str, Any]:
         """What is written beside the images."""
@@ -178,13 +170,15 @@ def write_dataset(
     return sfm
 
 
-def _write_image(scene: Scene, folder: Path, exposure: Exposure | None, camera: int) -> None:
+def _write_image(camera: int) -> None:
     """Renders one image and writes its files."""
-    name = image_name(camera)
+    scene, folder, exposure = _writing
+    name, exif = image_name(camera), Image.Exif()
     colors, distances = render(scene.filmed_by(camera), camera)
     if exposure is not None:
         colors = exposure.expose(scene.cameras, camera, colors)
-    exif = Image.Exif() if exposure is None else exposure.exif(camera)
+        seconds = Fraction(SECONDS * exposure.gains[camera, 1]).limit_denominator(10**6)  # by the gain of green
+        exif[0x8769] = {33434: float(seconds), 33437: APERTURE, 34855: SPEED}  # its own directory: time, f-number, ISO
     Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / name, exif=exif)
     write_depths(scene, folder, camera, distances)
     if scene.movers is not None:
@@ -200,13 +194,8 @@ def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> 
     Image.fromarray(millimetres).save(folder / "depths" / image_name(camera))
 
 
-_job: Callable[[int], None]
-"""What each process of a pool does with the number of an image: forks inherit it, as a scene's functions cannot be
-sent."""
-
-
-def _do(number: int) -> None:
-    _job(number)
+_writing: tuple[Scene, Path, Exposure | None]
+"""What the processes of a pool write: forks inherit it, as a scene's functions cannot be sent."""
 
 
 def _write_images(
@@ -217,17 +206,17 @@ def _write_images(
     processes: int,
 ) -> None:
     """Renders and writes all images, by forked processes if there are several and the system can fork."""
-    global _job
+    global _writing
     for part in ("images", "depths", *(["moving"] if scene.movers else [])):
         (folder / part).mkdir()
-    _job, count = partial(_write_image, scene, folder, exposure), len(scene.cameras)
+    _writing, count = (scene, folder, exposure), len(scene.cameras)
     if min(processes, count) < 2 or "fork" not in get_all_start_methods():
         for camera in progress(range(count)):
-            _job(camera)
+            _write_image(camera)
         return
     pool = ProcessPoolExecutor(min(processes, count), get_context("fork"))
     try:
-        written = pool.map(_do, range(count))
+        written = pool.map(_write_image, range(count))
         for _ in progress(range(count)):
             next(written)
     finally:

@@ -17,7 +17,6 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool
 from nerfstudio.data.dataparsers import nerfstudio_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
@@ -81,21 +80,17 @@ class MMPIDataset(InputDataset):
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
-        name = self.image_filenames[image_idx]
-        try:
-            with Image.open(name) as image:  # gray, a palette, CMYK, 16 bits
-                if image.mode == "F":
-                    raise ValueError("its pixels are floating-point numbers")
-                if image.mode in SIXTEEN_BIT:
-                    deep = np.asarray(image).astype(np.int64)
-                    if deep.min() < 0 or deep.max() > 65535:
-                        raise ValueError("its pixels have more than 16 bits")
-                    gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
-                    pixels = np.repeat(gray[..., None], 3, axis=-1)
-                else:
-                    pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-        except UNREADABLE as error:
-            raise _unreadable(name, error) from error
+        with _opened(self.image_filenames[image_idx]) as image:  # gray, a palette, CMYK, 16 bits
+            if image.mode == "F":
+                raise ValueError("its pixels are floating-point numbers")
+            if image.mode in SIXTEEN_BIT:
+                deep = np.asarray(image).astype(np.int64)
+                if deep.min() < 0 or deep.max() > 65535:
+                    raise ValueError("its pixels have more than 16 bits")
+                gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
+                pixels = np.repeat(gray[..., None], 3, axis=-1)
+            else:
+                pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         if self.scale_factor == 1.0:
             return pixels
         size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
@@ -104,11 +99,8 @@ class MMPIDataset(InputDataset):
     def check_files(self) -> None:
         """Raises InputError naming an image file that is missing or no image, by its first bytes alone."""
         for name in self.image_filenames:
-            try:
-                with Image.open(name):
-                    pass
-            except UNREADABLE as error:
-                raise _unreadable(name, error) from error
+            with _opened(name):
+                pass
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where any image has one."""
@@ -118,9 +110,17 @@ class MMPIDataset(InputDataset):
             data["mask"] = torch.from_numpy(self.usable(image_idx))[..., None]
         elif file is not None:
             try:
-                data["mask"] = mask = read_mask(file, self.scale_factor)
-                if mask.shape[:2] != shape:
-                    raise ValueError(f"it has {mask.shape[1]} x {mask.shape[0]} pixels")
+                with Image.open(file) as image:
+                    gray = image.convert("L") if image.mode == "P" else image  # the numbers of a palette are no shades
+                    if self.scale_factor != 1.0:
+                        width, height = (int(side * self.scale_factor) for side in gray.size)
+                        gray = gray.resize((width, height), resample=Image.Resampling.NEAREST)
+                    shades = np.array(gray)
+                if shades.ndim != 2:
+                    raise ValueError("it has several channels")
+                if shades.shape != shape:
+                    raise ValueError(f"it has {shades.shape[1]} x {shades.shape[0]} pixels")
+                data["mask"] = torch.from_numpy(shades != 0)[..., None]
             except UNREADABLE as error:
                 raise InputError(
                     f"Mask {file} cannot be used ({brief(error)}): give one channel of the image's size, white where "
@@ -158,21 +158,14 @@ class MMPIDataset(InputDataset):
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
 
 
-def _unreadable(name: Path, error: Exception) -> InputError:
-    return InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.")
-
-
-def read_mask(file: Path, scale: float) -> Bool[Tensor, "H W 1"]:
-    """Where a mask is not black, at a multiple of its size. Raises ValueError if it has colour channels."""
-    with Image.open(file) as image:
-        gray = image.convert("L") if image.mode == "P" else image  # the numbers of a palette are no shades
-        if scale != 1.0:
-            width, height = (int(side * scale) for side in gray.size)
-            gray = gray.resize((width, height), resample=Image.Resampling.NEAREST)
-        shades = np.array(gray)
-    if shades.ndim != 2:
-        raise ValueError("it has several channels")
-    return torch.from_numpy(shades != 0)[..., None]
+@contextmanager
+def _opened(name: Path) -> Iterator[Image.Image]:
+    """An image file that is read within the block; InputError names it where that cannot be done."""
+    try:
+        with Image.open(name) as image:
+            yield image
+    except UNREADABLE as error:
+        raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.") from error
 
 
 def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:

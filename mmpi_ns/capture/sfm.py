@@ -129,12 +129,10 @@ def numbers_in_model(files: Sequence[Path], names: Sequence[str]) -> NDArray[np.
     whole = {name: m for m, name in enumerate(names)}
     often = Counter(Path(name).name for name in names)
     moved = {Path(name).name: m for m, name in enumerate(names) if often[Path(name).name] == 1}
-
-    def number(file: Path) -> int:
+    numbers = {}
+    for file in map(Path, files):
         endings = ("/".join(file.parts[i:]) for i in range(len(file.parts)))
-        return next((whole[ending] for ending in endings if ending in whole), moved.get(file.name, -1))
-
-    numbers = {file: number(file) for file in map(Path, files)}
+        numbers[file] = next((whole[ending] for ending in endings if ending in whole), moved.get(file.name, -1))
     claims = Counter(numbers.values())
     return np.array([numbers[file] if claims[numbers[file]] == 1 else -1 for file in map(Path, files)], np.int64)
 
@@ -146,15 +144,12 @@ class _Reader:
         self.name, self.data, self.at = path.name, path.read_bytes(), 0
         self.records = self.count(least)
 
-    def skip(self, size: int) -> int:
-        """Skips bytes and returns the place of the first."""
-        self.at += size
+    def take(self, form: str) -> tuple:
+        """The next numbers, of this form of ``struct``."""
+        begin, self.at = self.at, self.at + struct.calcsize(form)
         if self.at > len(self.data):
             raise ValueError(f"{self.name} ends too early, after {len(self.data)} bytes")
-        return self.at - size
-
-    def take(self, form: str) -> tuple:
-        return struct.unpack_from(form, self.data, self.skip(struct.calcsize(form)))
+        return struct.unpack_from(form, self.data, begin)
 
     def count(self, least: int) -> int:
         """A number of records of at least this many bytes each, which must fit into the rest of the file."""
@@ -174,7 +169,7 @@ def _check_binary_files(folder: Path) -> None:
         number, model, _, _ = files[0].take("<IiQQ")
         if not 0 <= model < len(PARAMETERS):
             raise ValueError(f"cameras.bin has a camera of model {model}, which is not known")
-        files[0].skip(8 * PARAMETERS[model])
+        files[0].take(f"{8 * PARAMETERS[model]}x")
         cameras.add(number)
     for _ in range(files[1].records):
         number, *_, camera = files[1].take("<I7dI")
@@ -185,12 +180,12 @@ def _check_binary_files(folder: Path) -> None:
             raise ValueError("images.bin ends within a name")
         files[1].at = end + 1
         images[number] = files[1].count(24)
-        begin = files[1].skip(24 * images[number])
+        begin, _ = files[1].at, files[1].take(f"{24 * images[number]}x")
         seen.append(np.frombuffer(files[1].data, KEYPOINT, images[number], begin)["point"])
     for _ in range(files[2].records):
         points.add(files[2].take("<Q3d3Bd")[0])
-        begin = files[2].skip(8 * files[2].count(8))
-        for image, keypoint in struct.iter_unpack("<II", files[2].data[begin : files[2].at]):
+        (track,) = files[2].take(f"{8 * files[2].count(8)}s")
+        for image, keypoint in struct.iter_unpack("<II", track):
             if keypoint >= images.get(image, 0):
                 raise ValueError(f"points3D.bin names keypoint {keypoint} of image {image}, which images.bin has not")
     for file in files:

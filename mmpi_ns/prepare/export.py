@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.images import QUALITY, Photo
 from mmpi_ns.prepare.poses import read_intrinsics
 from mmpi_ns.utils.errors import InputError, progress
-from mmpi_ns.utils.files import whole, write_text
+from mmpi_ns.utils.files import whole
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 """Written explicitly: without it, nerfstudio-data assumes an axis swap if colmap/sparse/0 exists."""
@@ -143,14 +142,6 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
         small = small.convert("RGB")
     with whole(target) as partial:
         small.save(partial, format=kind, quality=QUALITY, subsampling=0, exif=tags)
-
-
-def write_scene(model: pycolmap.Reconstruction, scene: Path, content: dict[str, Any]) -> None:
-    """Writes the COLMAP model, the points, and last transforms.json."""
-    (scene / "colmap" / "sparse" / "0").mkdir(parents=True, exist_ok=True)
-    model.write(scene / "colmap" / "sparse" / "0")
-    model.export_PLY(scene / "sparse_pc.ply")
-    write_text(scene / "transforms.json", json.dumps(content, indent=1))
 
 
 def publish(built: Path, scene: Path, replaced: Path) -> None:

@@ -356,19 +356,15 @@ def _start_from(task: Task, name: str, focals: Mapping[int, float]) -> Path:
 def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[str], task: Task) -> list[Witness]:
     """Runs the global mapper on some images from all starts in parallel on all cores; failed starts are left out."""
     cores = task.threads if task.threads > 0 else os.cpu_count() or 1
-    workers = min(cores, len(starts))
-
-    def run(start: tuple[str, dict[int, float]]) -> pycolmap.Reconstruction | None:
-        model = map_globally(task, *start, names, max(1, cores // workers))
-        advance()
-        return model
-
+    workers, models = min(cores, len(starts)), []
     with (
         progress("Global mapping", len(starts)) as advance,
         quiet(),  # outermost: each mapper's own would end before the other is done
         ThreadPoolExecutor(workers) as pool,
     ):
-        models = list(pool.map(run, starts))
+        for model in pool.map(lambda s: map_globally(task, s[0], s[1], names, max(1, cores // workers)), starts):
+            models.append(model)
+            advance()
     candidates = []
     for (name, _), model in zip(starts, models, strict=True):
         if model is None:

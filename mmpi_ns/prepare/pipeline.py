@@ -223,7 +223,10 @@ class Preparation:
             folder, masks = flat / "images", flat / "masks" if masks else None
         export.write_images(folder, masks, photos, built, s.downscales)
         notes = {"unit": unit, "up": up, "mapping": says, "matching": self.matching}
-        export.write_scene(model, built, export.transforms(model, split, masks is not None, notes))
+        (built / "colmap/sparse/0").mkdir(parents=True)
+        model.write(built / "colmap/sparse/0")
+        model.export_PLY(built / "sparse_pc.ply")
+        write_text(built / "transforms.json", json.dumps(export.transforms(model, split, bool(masks), notes), indent=1))
         rows = {
             "images registered": f"{len(photos)} of {len(self.photos)}",
             "matching": self.matching,

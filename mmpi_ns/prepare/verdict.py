@@ -209,12 +209,10 @@ def best_first(witnesses: Sequence[Witness], is_sequence: bool) -> list[Witness]
     is seldom wrong. Then by verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by
     matches that became points. (A bent track may have more points than a right one: its points fit its bends.)
     """
-    graded: list[tuple[Grade, Witness]] = [(judge_alone(witness, is_sequence).grade, witness) for witness in witnesses]
-    most = max((len(witness.images) for grade, witness in graded if grade != "broken"), default=0)
-
-    def key(pair: tuple[Grade, Witness]) -> tuple[bool, bool, int, int, float, float]:
-        grade, witness = pair
-        size, tracked = len(witness.images), float(witness.pairs.tracked.sum())
-        return grade != "broken", size >= NEARLY_ALL * most, -ORDER.index(grade), size, _fit(witness), tracked
-
-    return [witness for _, witness in sorted(graded, key=key, reverse=True)]
+    grades, sizes = [judge_alone(w, is_sequence).grade for w in witnesses], [len(w.images) for w in witnesses]
+    most = max((size for grade, size in zip(grades, sizes, strict=True) if grade != "broken"), default=0)
+    credits = [
+        (g != "broken", n >= NEARLY_ALL * most, -ORDER.index(g), n, _fit(w), float(w.pairs.tracked.sum()))
+        for g, n, w in zip(grades, sizes, witnesses, strict=True)
+    ]
+    return [witnesses[i] for i in sorted(range(len(credits)), key=credits.__getitem__, reverse=True)]
