@@ -22,7 +22,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
+from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, opened, say_once
 from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
@@ -123,8 +123,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def create_train_dataset(self) -> MMPIDataset:
         # First, so that what is wrong with the test images is said before minutes of matching.
         self._test_images = super().create_eval_dataset()
-        if self.test_mode == "val":
-            self._test_images.check_files()
+        for name in self._test_images.image_filenames if self.test_mode == "val" else ():
+            with opened(name):
+                pass
         self.train_dataset = dataset = super().create_train_dataset()
         if min(int(dataset.cameras.width.min()), int(dataset.cameras.height.min())) < 1:
             raise InputError(

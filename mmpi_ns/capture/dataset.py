@@ -27,15 +27,13 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from mmpi_ns.capture.checks import check_places, names_of_copies, say_once
+from mmpi_ns.capture.checks import UNREADABLE, check_places, names_of_copies, opened, say_once
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.host import transforms_changed
 
-# Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
-UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
 SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 """Pillow's modes of gray images with up to 16 bits a pixel."""
 NO_MASK = "no mask"
@@ -80,7 +78,7 @@ class MMPIDataset(InputDataset):
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
-        with _opened(self.image_filenames[image_idx]) as image:  # gray, a palette, CMYK, 16 bits
+        with opened(self.image_filenames[image_idx]) as image:  # gray, a palette, CMYK, 16 bits
             if image.mode == "F":
                 raise ValueError("its pixels are floating-point numbers")
             if image.mode in SIXTEEN_BIT:
@@ -95,12 +93,6 @@ class MMPIDataset(InputDataset):
             return pixels
         size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
         return np.array(Image.fromarray(pixels).resize(size, resample=Image.Resampling.BILINEAR))
-
-    def check_files(self) -> None:
-        """Raises InputError naming an image file that is missing or no image, by its first bytes alone."""
-        for name in self.image_filenames:
-            with _opened(name):
-                pass
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where any image has one."""
@@ -156,16 +148,6 @@ class MMPIDataset(InputDataset):
         if self.moving is not None:
             return ~self.moving[image_idx]
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
-
-
-@contextmanager
-def _opened(name: Path) -> Iterator[Image.Image]:
-    """An image file that is read within the block; InputError names it where that cannot be done."""
-    try:
-        with Image.open(name) as image:
-            yield image
-    except UNREADABLE as error:
-        raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.") from error
 
 
 def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:

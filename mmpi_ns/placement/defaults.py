@@ -35,25 +35,14 @@ at a time, so these and the rays of new views are some three rounds of them."""
 MOST_RAYS_TIMES = 4
 """Largest multiple of a method's rays: steps become as many times fewer. As many rays in a quarter of the steps give
 images as good, in an eighth worse ones (docs/log/performance.md)."""
-POSITIVE, NOT_NEGATIVE = Number(0, above=True), Number(0)
 RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),
-    "max_texels": NOT_NEGATIVE,
-    "min_gain": NOT_NEGATIVE,
-    "planes": Number(2, MOST_PLANES, whole=True),
-    "max_planes": Number(2, MOST_PLANES, whole=True),
-    "plane_pixels": POSITIVE,
-    "texel_pixels": POSITIVE,
-    "rays_per_texel": NOT_NEGATIVE,
-    "texels_per_ray": NOT_NEGATIVE,
-    "height": Number(2, MOST_TEXELS, whole=True),
-    "width": Number(2, MOST_TEXELS, whole=True),
-    "enough": POSITIVE,
-    "texel_cost": NOT_NEGATIVE,
-    "max_voxels": Number(0, MOST_VOXELS, whole=True),
-    "window_length": NOT_NEGATIVE,
-    "drive_pull_back": NOT_NEGATIVE,
-    "cube_voxels": Number(0, MOST_VOXELS, whole=True),
+    **dict.fromkeys(("planes", "max_planes"), Number(2, MOST_PLANES, whole=True)),
+    **dict.fromkeys(("height", "width"), Number(2, MOST_TEXELS, whole=True)),
+    **dict.fromkeys(("max_voxels", "cube_voxels"), Number(0, MOST_VOXELS, whole=True)),
+    **dict.fromkeys(("plane_pixels", "texel_pixels", "enough"), Number(0, above=True)),
+    **dict.fromkeys(("max_texels", "rays_per_texel", "texels_per_ray", "texel_cost"), Number(0)),
+    **dict.fromkeys(("min_gain", "window_length", "drive_pull_back"), Number(0)),
 }
 FACES = ("front", "left", "right", "below")
 

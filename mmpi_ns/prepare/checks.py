@@ -13,8 +13,7 @@ import pycolmap
 from matplotlib.figure import Figure
 
 from mmpi_ns.capture.exif import light_of
-from mmpi_ns.prepare.adjustment import WIDE, adjust, focal_in_words, is_bent, with_fewer_points
-from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between
+from mmpi_ns.prepare.adjustment import WIDE, Array, adjust, camera_poses, degrees_between, is_bent, with_fewer_points
 from mmpi_ns.prepare.evidence import local_median
 from mmpi_ns.prepare.images import in_short
 from mmpi_ns.utils.files import write_text
@@ -97,13 +96,13 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
 
 
 def doubtful_intrinsics(
-    model: pycolmap.Reconstruction, is_fixed: bool, focal: tuple[float, float] | None, threads: int
+    model: pycolmap.Reconstruction, is_fixed: bool, focal: tuple[float, str] | None, threads: int
 ) -> list[Finding]:
     """Models, focal lengths (``focal``: the interval in pixels of one that was refined) and lenses that do not fit.
     Fixed intrinsics, which were given, are refined in a copy and compared."""
     findings = []
-    if focal is not None and focal[1] - focal[0] >= WIDE * focal[1]:
-        says = f"the images hardly determine the focal length ({focal_in_words(*focal)})"
+    if focal is not None and focal[0] >= WIDE:
+        says = f"the images hardly determine the focal length ({focal[1]})"
         findings.append(Finding("intrinsics?", "", f"{says}: give --focal if you know it"))
     if is_bent(model):
         error = model.compute_mean_reprojection_error()

@@ -21,7 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.sfm import MIN_INLIERS, epipolar_distances, verified_matches
-from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between, rotation_between, similarity_between
+from mmpi_ns.prepare.adjustment import Array, camera_poses, degrees_between, rotation_between, similarity_between
 
 Places = NDArray[np.int64]
 

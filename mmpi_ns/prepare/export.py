@@ -15,7 +15,7 @@ from PIL import Image
 
 from mmpi_ns.capture.exif import kept_tags
 from mmpi_ns.capture.sfm import quiet
-from mmpi_ns.prepare.alignment import camera_poses
+from mmpi_ns.prepare.adjustment import camera_poses
 from mmpi_ns.prepare.images import QUALITY, Photo
 from mmpi_ns.prepare.poses import read_intrinsics
 from mmpi_ns.utils.errors import InputError, progress

@@ -26,7 +26,6 @@ from mmpi_ns.capture.sfm import (
     match_pairs,
     new_model,
     quiet,
-    verified_matches,
     write_images,
 )
 from mmpi_ns.prepare.images import Photo
@@ -132,16 +131,6 @@ def matching_pairs(database: Path) -> list[tuple[int, int]]:
     with pycolmap.Database.open(database) as opened:
         pairs, inliers = opened.read_two_view_geometry_num_inliers()
     return [pycolmap.pair_id_to_image_pair(p) for p, n in zip(pairs, inliers, strict=True) if n >= MIN_INLIERS]
-
-
-def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:
-    """Keypoints of these images with a verified match in another of them."""
-    matched: dict[int, set[int]] = {i: set() for i in image_ids}
-    for *pair, matches in verified_matches(database):
-        if all(i in matched for i in pair):
-            for i, keypoints in zip(pair, matches.T, strict=True):
-                matched[i].update(keypoints.tolist())
-    return sum(map(len, matched.values()))
 
 
 def image_similarity(database: Path, count: int) -> NDArray[np.float32]:

@@ -23,8 +23,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from mmpi_ns.capture.sfm import load_pycolmap, new_model, rigid3d
 from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images
-from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval, map_known_poses
-from mmpi_ns.prepare.alignment import camera_poses, choose_frame
+from mmpi_ns.prepare.adjustment import Free, camera_poses, choose_frame, focal_interval, map_known_poses
 from mmpi_ns.prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.poses import make_cameras, parse_camera, read_poses
@@ -232,7 +231,7 @@ class Preparation:
             "matching": self.matching,
             "mapping": says,
             "verdict": f"{verdict.grade} {verdict.says}".strip(),
-            "focal length": focal_in_words(*self.mapped["focal"]) if self.mapped["focal"] else "given",
+            "focal length": self.mapped["focal"][1] if self.mapped["focal"] else "given",
             "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
             "what moves": moves,
             "up": up,

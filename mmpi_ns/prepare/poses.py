@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import pycolmap
 
-from mmpi_ns.prepare.alignment import Array, nearest_rotation
+from mmpi_ns.prepare.adjustment import Array, nearest_rotation
 from mmpi_ns.prepare.images import IMAGES, Photo, natural_key
 from mmpi_ns.utils.errors import InputError, say
 

@@ -25,21 +25,15 @@ from mmpi_ns.prepare.images import in_short
 Grade = Literal["right", "doubtful", "broken"]
 ORDER: tuple[Grade, ...] = ("right", "doubtful", "broken")
 
-TRACKED = (0.55, 0.3)
-"""Share of all verified matches that must have become points: below the first doubtful, below the second broken."""
-FITTING = (0.9, 0.5)
-"""Share of the matches on or close beside their epipolar lines that must lie on them: where many are beside, the track
-is bent. (Matches far off are false, or belong to what moves.)"""
-FITTING_ACROSS = (0.83, 0.5)
-"""The same across each gap between frames."""
-HELD_ACROSS = (0.5, 0.25)
-"""Share of all matches across each gap that must lie on their epipolar lines: false matches are fewer."""
-HELD_BY_SIDE = (0.4, 0.15)
-"""Share of an image's matches with earlier, or with later, images that must lie on their epipolar lines."""
-BRIDGED = (0.5, 0.25)
-"""Share of the matches across each gap between frames that must have become points..."""
-BRIDGED_OF_USUAL = (0.6, 0.35)
-"""... and the same as a share of what the other gaps have."""
+TRACKED, BRIDGED, BRIDGED_OF_USUAL = (0.55, 0.3), (0.5, 0.25), (0.6, 0.35)
+"""Share of the verified matches that must have become points, of all and of those across each gap between frames, and
+the latter as a share of what others have. Like all pairs here: doubtful below the first, broken below the second."""
+FITTING, FITTING_ACROSS = (0.9, 0.5), (0.83, 0.5)
+"""Share of the matches on or close beside their epipolar lines that must lie on them, of all and across each gap: where
+many are beside, the track is bent. (Matches far off are false, or belong to what moves.)"""
+HELD_ACROSS, HELD_BY_SIDE = (0.5, 0.25), (0.4, 0.15)
+"""Share of all matches that must lie on their epipolar lines: of those across each gap, as false matches are fewer, and
+of an image's matches with earlier, or with later, images."""
 EDGE = 3
 """Number of images at either end of the track where a break means little."""
 SCALE = (0.03, 0.2)

@@ -14,8 +14,7 @@ from PIL import Image
 
 from mmpi_ns.capture.sfm import rigid3d
 from mmpi_ns.prepare import export, features, mapping
-from mmpi_ns.prepare.adjustment import Free, adjust, is_bent, polish, quality
-from mmpi_ns.prepare.alignment import choose_frame, similarity_between
+from mmpi_ns.prepare.adjustment import Free, adjust, choose_frame, is_bent, polish, quality, similarity_between
 from mmpi_ns.prepare.images import Photo, choose_frames, median_motion
 from mmpi_ns.prepare.poses import Intrinsics, make_cameras, read_intrinsics
 from mmpi_ns.utils.errors import InputError
