@@ -63,12 +63,6 @@ class Primitives:
     def __len__(self) -> int:
         return len(self.kind)
 
-    @property
-    def radius(self) -> Array:
-        """[P] of the bounding spheres."""
-        flat = np.hypot(self.half[:, 0], np.where(self.kind == BOX, self.half[:, 1], 0.0))
-        return np.where(self.kind == SPHERE, self.half[:, 0], np.hypot(flat, self.half[:, 2]))
-
     @staticmethod
     def merged(*parts: Primitives) -> tuple[Primitives, NDArray[np.int64]]:
         """All parts as one, sorted, and the number of the part that each solid comes from. [P]"""
@@ -98,8 +92,10 @@ class Tracer:
     """Finds first hits; ``reach`` is how far a ray goes before solids no longer count."""
 
     def __init__(self, primitives: Primitives, reach: float) -> None:
-        self.primitives, self.reach = primitives, reach
-        self.radius = primitives.radius
+        self.primitives, self.reach, half = primitives, reach, primitives.half
+        flat = np.hypot(half[:, 0], np.where(primitives.kind == BOX, half[:, 1], 0.0))
+        self.radius = np.where(primitives.kind == SPHERE, half[:, 0], np.hypot(flat, half[:, 2]))
+        """[P] of the bounding spheres."""
         self.widest = float(self.radius.max(initial=0.0))
         self.top = float((primitives.center[:, 2] + primitives.half[:, 2]).max(initial=0.0))
         """Height above which there is nothing."""

@@ -31,7 +31,7 @@ from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import drop_masked, observe, posed_images
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
 from mmpi_ns.capture.ray_sources import PixelPool, RaySources, rays_to_keypoints
-from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.rays import CameraRays
 from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -137,7 +137,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         device = self.device
-        generate = PinholeRays.of(dataset.cameras, device) or RayGenerator(dataset.cameras.to(device))
+        generate = CameraRays.of(dataset.cameras, device) or RayGenerator(dataset.cameras.to(device))
         self.train_ray_generator: Any = lambda pixels: generate(pixels.to(device))
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
             if self.config.mask_moving and None in dataset.mask_files:
