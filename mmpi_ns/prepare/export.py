@@ -17,7 +17,7 @@ from mmpi_ns.capture.exif import kept_tags
 from mmpi_ns.capture.sfm import quiet
 from mmpi_ns.prepare.adjustment import camera_poses
 from mmpi_ns.prepare.images import QUALITY, Photo
-from mmpi_ns.prepare.poses import read_intrinsics
+from mmpi_ns.prepare.poses import opencv_intrinsics
 from mmpi_ns.utils.errors import InputError, progress
 from mmpi_ns.utils.files import whole
 
@@ -70,16 +70,16 @@ def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Spli
 def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes: dict[str, Any]) -> dict[str, Any]:
     """transforms.json for the registered images; intrinsics that all share are at the top level. Raises InputError if
     nerfstudio-data reads no scene with these lenses."""
-    lenses = {number: read_intrinsics(camera) for number, camera in model.cameras.items()}
-    if len({lens.fisheye for lens in lenses.values()}) > 1:
+    lenses = {number: opencv_intrinsics(camera) for number, camera in model.cameras.items()}
+    kinds = {is_fisheye for _, is_fisheye in lenses.values()}
+    if len(kinds) > 1:
         raise InputError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
-    is_fisheye = any(lens.fisheye for lens in lenses.values())
-    keys = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2")
+    keys = ("k1", "k2", "k3", "k4") if True in kinds else ("k1", "k2", "p1", "p2")
     entries: dict[int, dict[str, Any]] = {}
-    for number, lens in lenses.items():
+    for number, (values, _) in lenses.items():
         size = {"w": model.cameras[number].width, "h": model.cameras[number].height}
-        entry = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, **size}
-        entries[number] = entry | dict(zip(keys, lens.distortion, strict=True))
+        entry = dict(zip(("fl_x", "fl_y", "cx", "cy"), values[:4], strict=True)) | size
+        entries[number] = entry | dict(zip(keys, values[4:], strict=True))
     is_shared = len(entries) == 1
     camera_of = {image.name: image.camera_id for image in model.images.values()}
     frames = []
@@ -91,7 +91,7 @@ def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes:
         frames.append({**frame, "transform_matrix": (pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()})
     test = [f"images/{n}" for n in split.test]
     return {
-        "camera_model": "OPENCV_FISHEYE" if is_fisheye else "OPENCV",
+        "camera_model": "OPENCV_FISHEYE" if True in kinds else "OPENCV",
         **(next(iter(entries.values())) if is_shared else {}),
         "frames": frames,
         "train_filenames": [f"images/{n}" for n in split.train],

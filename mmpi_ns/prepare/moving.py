@@ -16,7 +16,7 @@ from mmpi_ns.capture.moving import draw_moving, find_moving, in_image
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import straightened_color
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.poses import read_intrinsics
+from mmpi_ns.prepare.poses import opencv_intrinsics
 
 
 def write_masks(
@@ -63,13 +63,13 @@ def write_masks(
 
 def _posed_images(model: pycolmap.Reconstruction, entries: Sequence[pycolmap.Image], folder: Path) -> PosedImages:
     cameras = [model.cameras[entry.camera_id] for entry in entries]
-    lenses = [read_intrinsics(camera) for camera in cameras]
+    lenses, fisheye = zip(*map(opencv_intrinsics, cameras), strict=True)
     poses = np.array([entry.cam_from_world().inverse().matrix() for entry in entries], np.float64)
     return PosedImages(
         files=tuple(folder / entry.name for entry in entries),
         camera_to_worlds=poses @ np.diag([1.0, -1.0, -1.0, 1.0]),
-        intrinsics=np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses]),
+        intrinsics=np.array(lenses)[:, :4],
         sizes=np.array([[camera.width, camera.height] for camera in cameras], np.float64),
-        distortion=np.array([lens.distortion for lens in lenses]),
-        fisheye=np.array([lens.fisheye for lens in lenses]),
+        distortion=np.array(lenses)[:, 4:],
+        fisheye=np.array(fisheye),
     )

@@ -30,20 +30,14 @@ KIND = re.compile(r"[._-]?(pose|color|rgb|image)s?$", re.IGNORECASE)
 """End of a name that differs between images and poses: frame-000001.color.png, frame-000001.pose.txt."""
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """A lens in pixels of one image: OpenCV's pinhole and distortion, or OpenCV's fisheye."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2; k1 to k4 of a fisheye lens."""
-    fisheye: bool = False
+def opencv_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:
+    """A camera of no size by fx, fy, cx, cy and the terms of its lens, k1, k2, p1, p2 or k1 to k4 of a fisheye; a
+    pinhole where there are none."""
+    model = "OPENCV_FISHEYE" if fisheye else "OPENCV" if any(values[4:]) else "PINHOLE"
+    return pycolmap.Camera(model=model, params=[*values, 0.0, 0.0, 0.0, 0.0][: 4 if model == "PINHOLE" else 8])
 
 
-def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
+def parse_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:
     """The camera of ``--camera``. Raises InputError if the numbers fit none or a focal length is not positive."""
     if len(values) not in GIVEN_COUNTS:
         raise InputError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
@@ -51,12 +45,11 @@ def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
         values = (values[0], *values)
     if min(values[:2]) <= 0:
         raise InputError("--camera: focal lengths must be positive, in pixels.")
-    lens = tuple(values[4:]) or (0.0,) * 4
-    return Intrinsics(*values[:4], distortion=lens, fisheye=fisheye)  # type: ignore[arg-type]
+    return opencv_camera(values, fisheye)
 
 
 def make_cameras(
-    photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
+    photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, pycolmap.Camera], focal: float | None, lens: Lens
 ) -> tuple[list[int], list[pycolmap.Camera]]:
     """Cameras from given intrinsics (``lenses`` by image name, ``focal`` in pixels), else from EXIF, else guessed;
     images of one size, lens and known intrinsics share one, unless ``sharing`` says otherwise.
@@ -72,36 +65,33 @@ def make_cameras(
     numbers: list[int] = []
     cameras: list[pycolmap.Camera] = []
     for photo in photos:
-        intrinsics = lenses.get(photo.name)
-        key = (photo.width, photo.height, "" if sharing == "shared" else photo.lens, intrinsics)
+        known = lenses.get(photo.name)
+        given = known and (known.model.name, *known.params)
+        key = (photo.width, photo.height, "" if sharing == "shared" else photo.lens, given)
         number = by_key.setdefault(photo.name if sharing == "per-image" else key, len(cameras) + 1)
         numbers.append(number)
         if number <= len(cameras):
             continue
-        if intrinsics is not None:
-            params = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
-            is_bent = intrinsics.fisheye or any(intrinsics.distortion)
-            model = "OPENCV_FISHEYE" if intrinsics.fisheye else "OPENCV" if is_bent else "PINHOLE"
-            params += intrinsics.distortion if is_bent else ()
+        if known is not None:
             size = {"width": photo.width, "height": photo.height, "camera_id": number}
-            camera = pycolmap.Camera(model=model, params=params, **size)
+            camera = pycolmap.Camera(model=known.model, params=known.params, **size)
         else:
             model = MODELS["radial" if lens == "auto" and focal is None else "pinhole" if lens == "auto" else lens]
             guess = focal or photo.exif_focal or GUESSED_FOCAL * max(photo.width, photo.height)
             camera = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
-        camera.has_prior_focal_length = bool(intrinsics or focal or photo.exif_focal)
+        camera.has_prior_focal_length = bool(known or focal or photo.exif_focal)
         cameras.append(camera)
     return numbers, cameras
 
 
-def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
-    """A pycolmap camera as OpenCV's. Raises InputError if nerfstudio-data does not support the lens model."""
+def opencv_intrinsics(camera: pycolmap.Camera) -> tuple[list[float], bool]:
+    """The numbers of ``opencv_camera``, eight of them, and whether it is a fisheye. Raises InputError if
+    nerfstudio-data does not support the lens model."""
     name, terms = camera.model.name, [float(v) for v in camera.params[camera.extra_params_idxs()]]
     if name not in (*MODELS.values(), "SIMPLE_PINHOLE", "RADIAL"):
         raise InputError(f"Lens model {name} is not supported in transforms.json.")
     f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    k1, k2, k3, k4 = (*terms, 0.0, 0.0, 0.0, 0.0)[:4]
-    return Intrinsics(*f, distortion=(k1, k2, k3, k4), fisheye=name == "OPENCV_FISHEYE")
+    return [*f, *terms, 0.0, 0.0, 0.0, 0.0][:8], name == "OPENCV_FISHEYE"
 
 
 @dataclass(frozen=True)
@@ -112,7 +102,7 @@ class KnownPoses:
     """Camera to world, OpenCV axes (x right, y down, z forward). [4, 4]"""
     says: str
     """Format and how images were matched, in words."""
-    intrinsics: dict[str, Intrinsics] = field(default_factory=dict)
+    intrinsics: dict[str, pycolmap.Camera] = field(default_factory=dict)
     """Of the same images, from a transforms.json."""
     split: dict[str, Any] | None = None
     """A transforms.json's lists of files."""
@@ -252,8 +242,8 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
                     raise InputError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
                 fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
                 cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
-                lens = tuple(float(frame.get(k, 0.0)) for k in keys)
-                intrinsics[photo.name] = Intrinsics(fx * sx, fy * sy, cx * sx, cy * sy, lens, fisheye)  # type: ignore[arg-type]
+                values = (fx * sx, fy * sy, cx * sx, cy * sy, *(float(frame.get(k, 0.0)) for k in keys))
+                intrinsics[photo.name] = opencv_camera(values, fisheye)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
     split = meta if "train_filenames" in meta and "test_filenames" in meta else None
