@@ -30,10 +30,8 @@ FLOAT64_SAME = 1e-12
 """Cameras of a file closer together than this fraction of their distance from the origin count as one place."""
 ROTATION_SLACK = 0.01
 """Tolerance on the length of the axes of a pose, which should be 1."""
-FAR_OFF = 1000.0
-"""A camera this many times as far away as all but a few others is a mistake."""
-FEW = 0.1
-"""Fraction of the cameras that counts as a few."""
+FAR_OFF, FEW = 1000.0, 0.1
+"""A camera this many times as far away as all but a few others, this fraction of them, is a mistake."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 PATHS = ("file_path", "mask_path", "depth_file_path")
 PARSER_OPTIONS = {

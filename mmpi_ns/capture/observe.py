@@ -44,18 +44,16 @@ THUMBNAIL = 128
 """Maximum pixels along a side of the gray images for the plane sweep, box-filtered."""
 ENOUGH_KEYPOINTS = 20
 """Average number of keypoints in an image above which no plane sweep is needed."""
-CELLS = 48
-"""Cells of a coarse depth image along the longer side."""
-BEHIND = 1.15
-"""A point farther away than the nearest one around it by this factor is hidden."""
+CELLS, BEHIND = 48, 1.15
+"""Cells of a coarse depth image along the longer side; a point farther away than the nearest one around it by this
+factor is hidden."""
 POINT_ERROR = 0.01
 """Minimum relative error of the distance of a point."""
 CONTRADICTS = 6.0
 """Difference of two sources, in expected errors of both, from which one of them is wrong."""
-MOST_POINTS = 100_000
-"""Points that are used of a larger cloud, such as a laser scan's."""
-FARTHEST = 1e5
-"""Distance of a point from the cameras, over their own extent, from which it is a mistake."""
+MOST_POINTS, FARTHEST = 100_000, 1e5
+"""Points that are used of a larger cloud, such as a laser scan's; distance of one from the cameras, over their own
+extent, from which it is a mistake."""
 
 
 def observe(

@@ -25,10 +25,8 @@ if TYPE_CHECKING:
 
 OLDEST_PYCOLMAP = 4
 """First major version with the functions that this package calls."""
-MIN_TRACK = 3
-"""Points seen by fewer images are too uncertain to supervise depth."""
-MAX_ERROR_PX = 2.0
-"""Points with a larger mean reprojection error are left out."""
+MIN_TRACK, MAX_ERROR_PX = 3, 2.0
+"""Points seen by fewer images, or with a larger mean reprojection error, are too uncertain to supervise depth."""
 PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 16)
 """Parameters of COLMAP's camera models, by model number."""
 MIN_ANGLE = 0.5

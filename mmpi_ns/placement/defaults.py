@@ -35,14 +35,15 @@ at a time, so these and the rays of new views are some three rounds of them."""
 MOST_RAYS_TIMES = 4
 """Largest multiple of a method's rays: steps become as many times fewer. As many rays in a quarter of the steps give
 images as good, in an eighth worse ones (docs/log/performance.md)."""
+POSITIVE, NOT_NEGATIVE = Number(0, above=True), Number(0)
 RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),
     **dict.fromkeys(("planes", "max_planes"), Number(2, MOST_PLANES, whole=True)),
     **dict.fromkeys(("height", "width"), Number(2, MOST_TEXELS, whole=True)),
     **dict.fromkeys(("max_voxels", "cube_voxels"), Number(0, MOST_VOXELS, whole=True)),
-    **dict.fromkeys(("plane_pixels", "texel_pixels", "enough"), Number(0, above=True)),
-    **dict.fromkeys(("max_texels", "rays_per_texel", "texels_per_ray", "texel_cost"), Number(0)),
-    **dict.fromkeys(("min_gain", "window_length", "drive_pull_back"), Number(0)),
+    **dict.fromkeys(("plane_pixels", "texel_pixels", "enough"), POSITIVE),
+    **dict.fromkeys(("max_texels", "rays_per_texel", "texels_per_ray", "texel_cost"), NOT_NEGATIVE),
+    **dict.fromkeys(("min_gain", "window_length", "drive_pull_back"), NOT_NEGATIVE),
 }
 FACES = ("front", "left", "right", "below")
 

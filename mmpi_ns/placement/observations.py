@@ -36,10 +36,8 @@ HYPOTHESES = 64
 WINDOW = 7
 MAX_ANGLE = 30.0
 """Degrees between the viewing directions of views that are compared."""
-MIN_SCORE = 0.85
-"""Minimum correlation of a match."""
-MIN_MARGIN = 0.08
-"""Minimum lead over every match at another depth."""
+MIN_SCORE, MIN_MARGIN = 0.85, 0.08
+"""Minimum correlation of a match, and its minimum lead over every match at another depth."""
 SAMPLED, SAMPLED_PER_CAMERA = 6000, 16
 """Minimum number of observations that the choice is based on, in all and for each camera, if there are as many."""
 FRUSTUM_SHARE, FEW = 0.15, 10

@@ -29,10 +29,9 @@ PARTS = 20
 """Number of images from which the two halves of a capture are also used separately to judge the focal length."""
 WIDE = 0.08
 """Width of the interval of the focal length, relative to it, from which --focal is asked for."""
-REFINE_ROUNDS = 3
-"""Rounds of refining known poses and triangulating points again."""
-COARSE_PX, FINE_PX = 8.0, 4.0
-"""Largest reprojection error of a point of known poses: while these are to be refined, and in the end."""
+REFINE_ROUNDS, COARSE_PX, FINE_PX = 3, 8.0, 4.0
+"""Rounds of refining known poses and triangulating points again; largest reprojection error of a point while these are
+to be refined, and in the end."""
 LEAST_SHARE = 0.2
 """Fraction of the matched keypoints that must become points; few do where known poses are those of other images."""
 BENT_PX = 0.8
@@ -41,12 +40,10 @@ ROTATION_WEIGHT = 1.0
 """Weight of rotations in the alignment of two tracks; the main direction of the centres has weight 1."""
 LEVEL_TURN = 0.15
 """Minimum spread of the cameras' right vectors across their main direction for estimating gravity."""
-LEAST_GROUND, GROUND_SHARE = 50, 0.15
-"""Minimum number of points below the cameras for fitting the ground, and the fraction that must lie on it."""
+LEAST_GROUND, GROUND_SHARE, TRIALS = 50, 0.15, 2000
+"""Minimum number of points below the cameras for fitting the ground, the fraction that must lie on it, planes tried."""
 GROUND_TILT = 25.0
 """Maximum angle in degrees between gravity estimated from the cameras and the normal of the ground."""
-TRIALS = 2000
-"""Planes tried for the ground (RANSAC)."""
 
 
 @dataclass(frozen=True)

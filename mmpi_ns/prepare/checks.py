@@ -20,18 +20,13 @@ from mmpi_ns.utils.files import write_text
 
 BLURRED = 0.4
 """Fraction of its neighbours' sharpness below which an image counts as blurred."""
-JUMP = 5.0
-"""Times its neighbours' step (or turn) from which a step counts as a jump."""
-TURN = 8.0
-"""Minimum angle of such a turn, degrees."""
-FOCAL_OFF = (0.03, 0.05)
-"""Relative change of a given focal length, when refined, from which it is doubted, and the scene with it..."""
-FOCAL_HELPS = (0.95, 0.85)
-"""... if refining it lowers the reprojection error below these fractions."""
-WORST = 5
-"""Number of images with the least coverage that are listed."""
-CELLS = (8, 6)
-"""Columns and rows of the grid for coverage."""
+JUMP, TURN = 5.0, 8.0
+"""Times its neighbours' step (or turn) from which a step counts as a jump; minimum angle of such a turn, degrees."""
+FOCAL_OFF, FOCAL_HELPS = (0.03, 0.05), (0.95, 0.85)
+"""Relative change of a given focal length, when refined, from which it is doubted, and the scene with it, if refining
+it lowers the reprojection error below these fractions."""
+WORST, CELLS = 5, (8, 6)
+"""Number of images with the least coverage that are listed; columns and rows of the grid for coverage."""
 
 
 @dataclass(frozen=True)

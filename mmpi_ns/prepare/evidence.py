@@ -25,21 +25,16 @@ from mmpi_ns.prepare.adjustment import Array, camera_poses, degrees_between, rot
 
 Places = NDArray[np.int64]
 
-FIT_PX = 2.0
-"""Sampson distance, in pixels of an image side of 1,000, up to which a match lies on its epipolar line."""
-BESIDE = 4.0
-"""Multiple of that distance up to which a match lies beside its line."""
-
+FIT_PX, BESIDE = 2.0, 4.0
+"""Sampson distance, in pixels of an image side of 1,000, up to which a match lies on its epipolar line, and the
+multiple of it up to which it lies beside it."""
 REACH = 12
 """Maximum frame distance of pairs used for a gap; pairs farther apart have few matches, most of them wrong."""
-FEW = 60
-"""Minimum number of matches across a gap for a statement about it."""
-FEW_OF_ONE = 40
-"""Minimum number of an image's matches with earlier or with later ones for a statement about it."""
-LEAST_ANGLE = 1.0
-"""Minimum angle in degrees between the first and last ray on one side of a gap for triangulation from that side."""
-LEAST_POINTS = 20
-"""Minimum number of such points for the scale of a gap."""
+FEW, FEW_OF_ONE = 60, 40
+"""Minimum number of matches for a statement about a gap, and of an image's with earlier or later ones about it."""
+LEAST_ANGLE, LEAST_POINTS = 1.0, 20
+"""Minimum angle in degrees between the first and last ray on one side of a gap for triangulation from that side, and
+minimum number of such points for the scale of a gap."""
 WINDOW = 5
 """Steps before and after a gap that are compared with each other."""
 

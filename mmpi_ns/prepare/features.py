@@ -34,32 +34,27 @@ from mmpi_ns.utils.files import whole
 
 DATABASE = "database.db"
 """Name of a database in its folder."""
-BATCH = 8
-"""Images extracted at a time: the most that an interruption loses."""
-PAIR_BATCH = 64
+BATCH, PAIR_BATCH = 8, 64
+"""Images extracted, and pairs matched, at a time: the most that an interruption loses."""
 LARGEST_SIDE = 2000
 """Larger images are reduced to this side for SIFT (docs/prepare.md has time and error by size)."""
-PIXELS_A_FEATURE = 100
-"""At most one feature for this many pixels: more are redundant, and the cost of matching is quadratic."""
-LEAST_FEATURES = 2048
-"""Small images may have this many."""
-FAINT = 0.003
-"""SIFT's peak threshold for images with few features: weak ones count too."""
-SAMPLE = 4
-"""Images that are looked at to find whether they have few."""
+PIXELS_A_FEATURE, LEAST_FEATURES = 100, 2048
+"""At most one feature for this many pixels, but small images may have the second number: more are redundant, and the
+cost of matching is quadratic."""
+FAINT, SAMPLE = 0.003, 4
+"""SIFT's peak threshold for images with few features: weak ones count too; and images looked at to find whether they
+have few."""
 FEATURES = 50
 """An image with fewer is of no use."""
 Matching = Literal["auto", "sequential", "exhaustive", "retrieval"]
-FEW = 40
-"""Up to this many images are matched exhaustively, whatever their order."""
-MANY = 120
-"""More unordered images than this are matched with similar ones only."""
+FEW, MANY = 40, 120
+"""Up to the first number images are matched exhaustively, whatever their order; more unordered ones than the second
+with similar ones only."""
 WORDS, WORDS_FROM, SUMMED, ROUNDS = 64, 20_000, 800, 8
 """Vocabulary size, descriptors it is learnt from, descriptors of an image that are summed, and rounds of k-means."""
-REVISITS = 3
-"""Similar images that each image of a sequence is matched with besides its neighbours in time."""
-LOOK_ALIKES = 30
-"""Similar images that each image of a large unordered set is matched with."""
+REVISITS, LOOK_ALIKES = 3, 30
+"""Similar images that each image of a sequence, besides its neighbours, and of a large unordered set is matched
+with."""
 FAR_STEPS = (15, 20, 30, 45)
 """Frame distances beyond the overlap that are matched too, because slow stretches need a longer baseline."""
 

@@ -33,10 +33,8 @@ QUALITY = 97
 """Of JPEG."""
 FILM_WIDTH = 36.0
 """Millimetres: EXIF's 35-mm equivalent refers to film this wide."""
-SIDE = 640
-"""Longer side, in pixels, at which sharpness is measured."""
-TRACK_WIDTH = 320
-"""Width at which motion is measured."""
+SIDE, TRACK_WIDTH = 640, 320
+"""Longer side at which sharpness is measured, and width at which motion is; pixels."""
 LOST = 0.15
 """Motion, relative to the width, assumed for frames that cannot be tracked from the last (a cut, a blank frame)."""
 MOST_MOTION = 0.15

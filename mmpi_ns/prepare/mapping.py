@@ -28,10 +28,9 @@ from mmpi_ns.prepare.features import matching_pairs
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, agrees, best_first, judge_alone, judge_together
 from mmpi_ns.utils.errors import InputError, progress, say
 
-ENOUGH = 0.95
-"""Fraction of registered images at which no further attempt is made."""
-CARRIES = 0.5
-"""Fraction of images from which a model is continued with looser settings instead of starting over."""
+ENOUGH, CARRIES = 0.95, 0.5
+"""Fraction of registered images at which no further attempt is made, and from which a model is continued with looser
+settings instead of starting over."""
 SNAPSHOT = 40
 """Images registered between two snapshots, from which an interrupted run resumes."""
 MANY = 100
