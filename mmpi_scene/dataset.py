@@ -139,18 +139,12 @@ def write_dataset(
     With movers also their exact masks (moving/), which transforms.json does not name: finding them is what is tried.
     With an exposure also exposure.json. All is in the scene's own frame, which applied_transform states.
 
-    Args:
-        points, noise_pixels, outliers: see ``sfm_points``.
-        images: False writes cameras and points alone.
-        overwrite: replaces a data set that is in the folder.
-        progress: wraps the image numbers as they are rendered.
-        tracks: False writes no points and no COLMAP model, which need pycolmap.
-        exposure: of the images; None: pixel values are the scene's colours.
-        processes: render side by side; the files do not depend on their number.
+    ``points``, ``noise_pixels`` and ``outliers`` are those of ``sfm_points``. Without ``images`` only cameras and
+    points are written, without ``tracks`` no points and no COLMAP model, which need pycolmap. ``progress`` wraps the
+    image numbers as they are rendered, by ``processes`` side by side; the files do not depend on their number.
 
-    Raises:
-        FileExistsError: the folder is in use and may not, or cannot safely, be overwritten. Nothing was touched.
-        ValueError: a number is out of range.
+    Raises FileExistsError if the folder is in use and may not, or cannot safely, be overwritten, and ValueError if a
+    number is out of range; nothing was touched then.
     """
     check_folder(folder, overwrite)
     sfm = sfm_points(scene, points, noise_pixels, outliers)

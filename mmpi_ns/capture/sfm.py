@@ -78,11 +78,7 @@ def checked_model(path: Path) -> Iterator[None]:
 
 def load_pycolmap() -> ModuleType:
     """pycolmap, which is slow to import. SIGTERM stays as it was: glog's handler prints a stack trace and may wait for
-    ever.
-
-    Raises:
-        InputError: pycolmap is too old.
-    """
+    ever. Raises InputError if pycolmap is too old."""
     handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 

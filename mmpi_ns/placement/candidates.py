@@ -77,11 +77,8 @@ class Candidate:
 
 
 def find_candidates(observations: Observations, visible: VisiblePoints, with_cubes: bool) -> list[Candidate]:
-    """Views of training cameras that are spread over the capture, and cubes.
-
-    Raises:
-        InputError: no camera has a field of view that an MPI can have.
-    """
+    """Views of training cameras that are spread over the capture, and cubes. Raises InputError if no camera has a field
+    of view that an MPI can have."""
     centers, back = observations.centers / max(visible.near, 1e-12), observations.camera_to_worlds[:, :, 2]
     places = np.concatenate([centers, back * 2], -1)
     most, candidates = MAX_WIDE_VIEWS if observations.wide.any() else MAX_VIEWS, []

@@ -263,13 +263,10 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
-    """The similarity that aligns camera poses with other poses of the same cameras.
+    """The similarity that aligns camera poses, camera to world [N, 4, 4], with other poses of the same cameras.
 
     Uses centres and rotations: the centres of a straight track do not fix its roll, and noise tilts a short one.
     (``pycolmap.estimate_sim3d`` uses centres alone, and gives up where they lie on a line or a plane, as drives do.)
-
-    Args:
-        source, target: camera to world. [N, 4, 4]
     """
     a = source[:, :3, 3] - source[:, :3, 3].mean(0)
     b = target[:, :3, 3] - target[:, :3, 3].mean(0)

@@ -189,10 +189,8 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
     epipolar lines show little.
 
     Args:
-        points: number of the point that each observation sees. [O]
-        frames: place of its image. [O]
-        centers: of its camera. [O, 3]
-        rays: unit, world axes. [O, 3]
+        points, frames: number of the point that each observation sees, and place of its image. [O]
+        centers, rays: of its camera, and unit, world axes. [O, 3]
         count: registered images, N.
 
     Returns:

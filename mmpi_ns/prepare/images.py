@@ -296,18 +296,10 @@ def median_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
 def choose_frames(
     motion: NDArray[np.float64], sharp: NDArray[np.float64], max_frames: int, step: float
 ) -> tuple[list[int], float]:
-    """The sharpest frame of every stretch of equal motion.
+    """The sharpest frame of every stretch of equal motion, by the motion of each frame since the one before, as a share
+    of the width [N], and its sharpness [N]; and the length of a stretch: ``step``, or more for ``max_frames`` at most.
 
     A camera that stands still adds no frame. The first and last stretch count like the others.
-
-    Args:
-        motion: since the frame before, as a share of the width. [N]
-        sharp: sharpness of every frame. [N]
-        max_frames: maximum number of frames; the step is increased if necessary.
-        step: motion of a stretch, as a share of the width.
-
-    Returns:
-        Indices of the frames, and the step used.
     """
     path = np.cumsum(motion)
     used = max(step, float(path[-1]) / max(max_frames - 1, 1) * (1 + 1e-9))
