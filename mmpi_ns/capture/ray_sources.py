@@ -213,7 +213,7 @@ class RaySources:
     def draw(
         self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
     ) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Rays of pixels, of new views and of keypoints, in this order, or of pixels alone, and what images say of them.
+        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and what images say of them.
 
         Returns:
             The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH, OWN_PIXEL and EXPOSURE in their metadata. The batch: ``image``,
