@@ -23,14 +23,8 @@ PACKET = 4096
 START = 1e-6
 """Hits nearer than this share of a metre are the surface that the ray starts on."""
 Color = Sequence[float]
-BEIGE, WHITE, BROWN, GREEN, GRAY = (
-    (0.86, 0.76, 0.6),
-    (0.95, 0.94, 0.9),
-    (0.42, 0.26, 0.15),
-    (0.2, 0.38, 0.12),
-    (0.5,) * 3,
-)
-PALE_GREEN = (0.5, 0.62, 0.25)
+BEIGE, WHITE, GRAY = (0.86, 0.76, 0.6), (0.95, 0.94, 0.9), (0.5,) * 3
+BROWN, GREEN, PALE_GREEN = (0.42, 0.26, 0.15), (0.2, 0.38, 0.12), (0.5, 0.62, 0.25)
 WALLS: tuple[Color, ...] = (
     (0.84, 0.68, 0.48), (0.78, 0.44, 0.34), (0.9, 0.84, 0.7), (0.62, 0.66, 0.68),
     (0.86, 0.56, 0.36), (0.66, 0.4, 0.32), (0.72, 0.76, 0.62), (0.92, 0.76, 0.42),
