@@ -112,19 +112,15 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
         for says, is_lens in trials:
             trial = adjusted(light, is_lens, center or not is_lens)
             advance()
-            before, after = rms_error(light), rms_error(trial)
+            # Root mean squares of the points' errors, each counted once for each image that sees it.
+            points = [[(p.error, p.track.length()) for p in m.points3D.values()] for m in (light, trial)]
+            columns = (np.array(rows, np.float64).reshape(-1, 2).T for rows in points)
+            before, after = (float(np.sqrt((e**2 * n).sum() / max(n.sum(), 1))) for e, n in columns)
             is_better = after < WORTH * before
             say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {'kept' if is_better else 'not kept'}.")
             if is_better:
                 light, center, four_terms = trial, center or not is_lens, four_terms or is_lens
     return adjusted(model, four_terms, center) if center or four_terms else model
-
-
-def rms_error(model: pycolmap.Reconstruction) -> float:
-    """Root mean square of the points' reprojection errors, each counted once for each image that sees it; pixels."""
-    errors = np.array([p.error for p in model.points3D.values()])
-    lengths = np.array([p.track.length() for p in model.points3D.values()])
-    return float(np.sqrt((errors**2 * lengths).sum() / max(int(lengths.sum()), 1)))
 
 
 def quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:

@@ -37,6 +37,9 @@ LEAST_ANGLE, LEAST_POINTS = 1.0, 20
 minimum number of such points for the scale of a gap."""
 WINDOW = 5
 """Steps before and after a gap that are compared with each other."""
+APART, TURNED = (0.01, 0.03), (1.0, 2.0)
+"""Mean and largest distance between the centres of two mappers, as shares of the track, up to which they found the same
+one, and the same of their rotations, in degrees."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,8 @@ class Agreement:
     """Distances of the centres, relative to the extent of the track. [N]"""
     turns: Array
     """Degrees between the rotations. [N]"""
+    is_same: bool
+    """Whether both are the same track."""
 
 
 def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
@@ -259,4 +264,7 @@ def agreement(first: Witness, second: Witness) -> Agreement | None:
     moved = a[:, :3, 3] @ similarity[:, :3].T + similarity[:, 3]
     extent = max(float(np.linalg.norm(np.ptp(b[:, :3, 3], axis=0))), 1e-12)
     turns = degrees_between(rotation_between(a[:, :3, :3], b[:, :3, :3]) @ a[:, :3, :3], b[:, :3, :3])
-    return Agreement(common, np.linalg.norm(moved - b[:, :3, 3], axis=-1) / extent, turns)
+    centers = np.linalg.norm(moved - b[:, :3, 3], axis=-1) / extent
+    limits = ((centers, APART), (turns, TURNED))
+    is_same = all(values.mean() <= mean and values.max() <= largest for values, (mean, largest) in limits)
+    return Agreement(common, centers, turns, is_same)

@@ -25,7 +25,7 @@ from mmpi_ns.capture.sfm import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.adjustment import STILL, Free, is_bent, polish, quality, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.features import matching_pairs
-from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, agrees, best_first, judge_alone, judge_together
+from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, best_first, judge_alone, judge_together
 from mmpi_ns.utils.errors import InputError, progress, say
 
 ENOUGH, CARRIES = 0.95, 0.5
@@ -291,7 +291,7 @@ def _candidates(task: Task) -> list[Witness]:
             candidates += _globally(some, task.placed, task)
             right = [w for w in candidates if judge_alone(w, task.is_ordered).grade == "right"]
             differences = [agreement(right[0], w) for w in right[1:]]
-            is_settled = bool(right) and all(d is not None and agrees(d) for d in differences)
+            is_settled = bool(right) and all(d is not None and d.is_same for d in differences)
     focals, is_part, failed = {}, len(task.placed) < len(task.offered), None
     if candidates and task.free.lens:
         best = best_first(candidates, task.is_ordered)[0].model

@@ -11,7 +11,6 @@ import numpy as np
 
 from mmpi_ns.prepare.evidence import (
     FEW,
-    Agreement,
     Array,
     Witness,
     agreement,
@@ -46,10 +45,6 @@ CHANGE = 2.5
 """Ratio of speeds that counts as a sudden change, treated alike."""
 WEAK = 0.8
 """Share of the usual below which matches hold badly beside a jump."""
-APART = (0.01, 0.03)
-"""Mean and largest distance between the centres of two mappers, as shares of the track, up to which they agree."""
-TURNED = (1.0, 2.0)
-"""The same of their rotations, in degrees."""
 NEARLY_ALL = 0.9
 """Share of the images of the largest track below which another has clearly fewer."""
 REMEDY = (
@@ -151,15 +146,6 @@ def _leaps(witness: Witness, across: Array, between: Sequence[str]) -> list[tupl
     return problems
 
 
-def agrees(difference: Agreement) -> bool:
-    """Whether two mappers found the same track."""
-    centers, turns = difference.centers, difference.turns
-    return all(
-        values.mean() <= limits[0] and values.max() <= limits[1]
-        for values, limits in ((centers, APART), (turns, TURNED))
-    )
-
-
 def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool) -> Verdict:
     """The verdict on the chosen model, given those of the other mapper and from other focal lengths.
 
@@ -169,11 +155,11 @@ def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool
     """
     alone = judge_alone(chosen, is_sequence)
     compared = [(other, d) for other in others if (d := agreement(chosen, other)) is not None]
-    is_confirmed = any(agrees(d) and other.name != chosen.name for other, d in compared)
+    is_confirmed = any(d.is_same and other.name != chosen.name for other, d in compared)
     against = [
         (other, d)
         for other, d in compared
-        if not agrees(d)
+        if not d.is_same
         and (
             (judge_alone(other, is_sequence).grade == "right" and not (is_confirmed and _fit(other) < _fit(chosen)))
             or (alone.grade != "right" and not is_confirmed)
