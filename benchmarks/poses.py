@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from report import Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene
-from mmpi_ns.prepare.alignment import degrees_between
+from mmpi_ns.prepare.adjustment import degrees_between
 from mmpi_ns.scripts.command import run
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from captures import Array, Truth, catalogue
 from lab import not_run
 from report import Bench, Report, Row, commit, page, table
 
-from mmpi_ns.prepare.alignment import degrees_between, nearest_rotation, rotation_between
+from mmpi_ns.prepare.adjustment import degrees_between, nearest_rotation, rotation_between
 from mmpi_ns.prepare.pipeline import WORK
 from mmpi_ns.scripts.command import run
 

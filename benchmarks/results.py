@@ -16,7 +16,7 @@ from suites import DEFAULT, SUITES
 
 from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.placement.errors import PixelErrors, pixel_errors
-from mmpi_ns.placement.visibility import find_visible_points
+from mmpi_ns.placement.observations import find_visible_points
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.command import run
 

@@ -42,18 +42,8 @@ def make_scene(
     height: int | None = None,
     length: float | None = None,
 ) -> Scene:
-    """A scene of the catalogue; equal arguments give equal scenes.
-
-    Args:
-        name: one of ``SCENES``.
-        seed: of everything random in it.
-        count: of its images; a long road has one every 1.5 m unless told otherwise.
-        width, height: of its images, pixels.
-        length: of a drive, metres.
-
-    Raises:
-        ValueError: there is no such scene, or it cannot be made like this.
-    """
+    """A scene of the catalogue, with ``count`` images of these pixels, of a drive of this length in metres; equal
+    arguments give equal scenes. Raises ValueError if there is no such scene, or it cannot be made like this."""
     if name not in SCENES:
         raise ValueError(f"There is no scene {name!r}: choose one of {', '.join(SCENES)}.")
     entry = SCENES[name]

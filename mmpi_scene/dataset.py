@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 from typing import Any, Literal
@@ -78,13 +77,6 @@ class Exposure:
         passed = (1 - self.vignetting * (offset**2).sum(-1)).reshape(cameras.height, cameras.width, 1)
         return tone(np.minimum(1, self.gains[camera] * passed * light_of(colors))).astype(np.float32)
 
-    def exif(self, camera: int) -> Image.Exif:
-        """EXIF of an image: the gain of green is its exposure time."""
-        exif = Image.Exif()
-        seconds = Fraction(SECONDS * self.gains[camera, 1]).limit_denominator(10**6)
-        exif[0x8769] = {33434: float(seconds), 33437: APERTURE, 34855: SPEED}  # its own directory: time, f-number, ISO
-        return exif
-
     def to_object(self, names: list[str]) -> dict[str, Any]:
         """What is written beside the images."""
         return {
@@ -98,14 +90,11 @@ class Exposure:
 
 
 def make_exposure(name: ExposureName, scene: Scene) -> Exposure | None:
-    """Exposures of a scene's images.
+    """Exposures of a scene's images, taken in the order of its cameras.
 
-    Args:
-        name: none: one exposure, pixel values are the scene's colours. auto: gains follow what an image sees, a few
-            images late, three-fold between the darkest and the brightest; white balance wanders by a tenth.
-            vignetting: one exposure, half of the light lost in the corners.
-        scene: with its cameras in the order in which they took the images.
-    """
+    none: one exposure, pixel values are the scene's colours. auto: gains follow what an image sees, a few images late,
+    three-fold between the darkest and the brightest; white balance wanders by a tenth. vignetting: one exposure, half
+    of the light lost in the corners."""
     if name == "none":
         return None
     count, log_gains = len(scene.cameras), np.zeros((len(scene.cameras), 3))
@@ -150,18 +139,12 @@ def write_dataset(
     With movers also their exact masks (moving/), which transforms.json does not name: finding them is what is tried.
     With an exposure also exposure.json. All is in the scene's own frame, which applied_transform states.
 
-    Args:
-        points, noise_pixels, outliers: see ``sfm_points``.
-        images: False writes cameras and points alone.
-        overwrite: replaces a data set that is in the folder.
-        progress: wraps the image numbers as they are rendered.
-        tracks: False writes no points and no COLMAP model, which need pycolmap.
-        exposure: of the images; None: pixel values are the scene's colours.
-        processes: render side by side; the files do not depend on their number.
+    ``points``, ``noise_pixels`` and ``outliers`` are those of ``sfm_points``. Without ``images`` only cameras and
+    points are written, without ``tracks`` no points and no COLMAP model, which need pycolmap. ``progress`` wraps the
+    image numbers as they are rendered, by ``processes`` side by side; the files do not depend on their number.
 
-    Raises:
-        FileExistsError: the folder is in use and may not, or cannot safely, be overwritten. Nothing was touched.
-        ValueError: a number is out of range.
+    Raises FileExistsError if the folder is in use and may not, or cannot safely, be overwritten, and ValueError if a
+    number is out of range; nothing was touched then.
     """
     check_folder(folder, overwrite)
     sfm = sfm_points(scene, points, noise_pixels, outliers)
@@ -181,13 +164,15 @@ def write_dataset(
     return sfm
 
 
-def _write_image(scene: Scene, folder: Path, exposure: Exposure | None, camera: int) -> None:
+def _write_image(camera: int) -> None:
     """Renders one image and writes its files."""
-    name = image_name(camera)
+    scene, folder, exposure = _writing
+    name, exif = image_name(camera), Image.Exif()
     colors, distances = render(scene.filmed_by(camera), camera)
     if exposure is not None:
         colors = exposure.expose(scene.cameras, camera, colors)
-    exif = Image.Exif() if exposure is None else exposure.exif(camera)
+        seconds = Fraction(SECONDS * exposure.gains[camera, 1]).limit_denominator(10**6)  # by the gain of green
+        exif[0x8769] = {33434: float(seconds), 33437: APERTURE, 34855: SPEED}  # its own directory: time, f-number, ISO
     Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / name, exif=exif)
     write_depths(scene, folder, camera, distances)
     if scene.movers is not None:
@@ -195,27 +180,16 @@ def _write_image(scene: Scene, folder: Path, exposure: Exposure | None, camera: 
 
 
 def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> None:
-    """Writes the depth image of a camera: millimetres along the optical axis, 0 where that is too far.
-
-    Args:
-        scene: whose cameras these are.
-        folder: of the data set.
-        camera: number of the camera.
-        distances: along the rays [H, W], metres.
-    """
+    """Writes the depth image of a camera, given metres along the rays [H, W]: millimetres along the optical axis, 0
+    where that is too far."""
     slant = np.sqrt(1 + (scene.cameras.central_tangents**2).sum(-1)).reshape(distances.shape)
     depths = 1000 * distances / slant
     millimetres = np.where(depths <= MILLIMETRES, depths, 0).round().astype(np.uint16)
     Image.fromarray(millimetres).save(folder / "depths" / image_name(camera))
 
 
-_job: Callable[[int], None]
-"""What each process of a pool does with the number of an image: forks inherit it, as a scene's functions cannot be
-sent."""
-
-
-def _do(number: int) -> None:
-    _job(number)
+_writing: tuple[Scene, Path, Exposure | None]
+"""What the processes of a pool write: forks inherit it, as a scene's functions cannot be sent."""
 
 
 def _write_images(
@@ -226,17 +200,17 @@ def _write_images(
     processes: int,
 ) -> None:
     """Renders and writes all images, by forked processes if there are several and the system can fork."""
-    global _job
+    global _writing
     for part in ("images", "depths", *(["moving"] if scene.movers else [])):
         (folder / part).mkdir()
-    _job, count = partial(_write_image, scene, folder, exposure), len(scene.cameras)
+    _writing, count = (scene, folder, exposure), len(scene.cameras)
     if min(processes, count) < 2 or "fork" not in get_all_start_methods():
         for camera in progress(range(count)):
-            _job(camera)
+            _write_image(camera)
         return
     pool = ProcessPoolExecutor(min(processes, count), get_context("fork"))
     try:
-        written = pool.map(_do, range(count))
+        written = pool.map(_write_image, range(count))
         for _ in progress(range(count)):
             next(written)
     finally:

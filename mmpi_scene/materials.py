@@ -21,13 +21,10 @@ TEXELS, PERIOD = 512, 16.0
 
 def pulse(x: Array, width: Array, start: float | Array, end: float | Array) -> Array:
     """Share of [x - width/2, x + width/2] covered by [start, end] of every unit interval."""
-
-    def covered(x: Array) -> Array:
-        whole = np.floor(x)
-        return whole * (end - start) + np.clip(x - whole - start, 0, end - start)
-
-    width = np.maximum(width, 1e-4)
-    return (covered(x + width / 2) - covered(x - width / 2)) / width
+    width, length = np.maximum(width, 1e-4), end - start
+    ends = ((end, np.floor(end)) for end in (x + width / 2, x - width / 2))
+    after, before = (whole * length + np.clip(end - whole - start, 0, length) for end, whole in ends)
+    return (after - before) / width
 
 
 def band(x: Array, width: Array, start: float | Array, end: float | Array) -> Array:

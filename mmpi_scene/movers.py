@@ -30,17 +30,8 @@ CHANGED = 1 / 255
 
 
 def movers_at(seed: int, road: Road, count: int, along: Array, walks: bool, camera: int) -> Primitives:
-    """Cars and people when an image is taken: in turns oncoming, ahead of the camera, crossing, on the pavement, and
-    overtaking.
-
-    Args:
-        seed: of their places and looks.
-        road: along which they move.
-        count: of cars and people.
-        along: metres along the road of each camera. [M]
-        walks: whether the cameras walk; else they drive.
-        camera: number of the image.
-    """
+    """Cars and people on a road when an image is taken: in turns oncoming, ahead of the camera, crossing, on the
+    pavement, and overtaking. ``along`` are metres along the road of each camera [M], which walks or drives."""
     speed, rows = WALKING if walks else DRIVING, []
     seconds = (along - along[0]) / speed
     now = float(seconds[camera])

@@ -23,14 +23,8 @@ PACKET = 4096
 START = 1e-6
 """Hits nearer than this share of a metre are the surface that the ray starts on."""
 Color = Sequence[float]
-BEIGE, WHITE, BROWN, GREEN, GRAY = (
-    (0.86, 0.76, 0.6),
-    (0.95, 0.94, 0.9),
-    (0.42, 0.26, 0.15),
-    (0.2, 0.38, 0.12),
-    (0.5,) * 3,
-)
-PALE_GREEN = (0.5, 0.62, 0.25)
+BEIGE, WHITE, GRAY = (0.86, 0.76, 0.6), (0.95, 0.94, 0.9), (0.5,) * 3
+BROWN, GREEN, PALE_GREEN = (0.42, 0.26, 0.15), (0.2, 0.38, 0.12), (0.5, 0.62, 0.25)
 WALLS: tuple[Color, ...] = (
     (0.84, 0.68, 0.48), (0.78, 0.44, 0.34), (0.9, 0.84, 0.7), (0.62, 0.66, 0.68),
     (0.86, 0.56, 0.36), (0.66, 0.4, 0.32), (0.72, 0.76, 0.62), (0.92, 0.76, 0.42),
@@ -63,12 +57,6 @@ class Primitives:
     def __len__(self) -> int:
         return len(self.kind)
 
-    @property
-    def radius(self) -> Array:
-        """[P] of the bounding spheres."""
-        flat = np.hypot(self.half[:, 0], np.where(self.kind == BOX, self.half[:, 1], 0.0))
-        return np.where(self.kind == SPHERE, self.half[:, 0], np.hypot(flat, self.half[:, 2]))
-
     @staticmethod
     def merged(*parts: Primitives) -> tuple[Primitives, NDArray[np.int64]]:
         """All parts as one, sorted, and the number of the part that each solid comes from. [P]"""
@@ -98,8 +86,10 @@ class Tracer:
     """Finds first hits; ``reach`` is how far a ray goes before solids no longer count."""
 
     def __init__(self, primitives: Primitives, reach: float) -> None:
-        self.primitives, self.reach = primitives, reach
-        self.radius = primitives.radius
+        self.primitives, self.reach, half = primitives, reach, primitives.half
+        flat = np.hypot(half[:, 0], np.where(primitives.kind == BOX, half[:, 1], 0.0))
+        self.radius = np.where(primitives.kind == SPHERE, half[:, 0], np.hypot(flat, half[:, 2]))
+        """[P] of the bounding spheres."""
         self.widest = float(self.radius.max(initial=0.0))
         self.top = float((primitives.center[:, 2] + primitives.half[:, 2]).max(initial=0.0))
         """Height above which there is nothing."""
@@ -114,13 +104,8 @@ class Tracer:
     def __call__(
         self, origins: Array, directions: Array, limit: float | None = None
     ) -> tuple[Array, NDArray[np.int64]]:
-        """Distance [R] to the first solid within reach (inf for none) and its row (-1).
-
-        Args:
-            origins: [R, 3]
-            directions: [R, 3] unit vectors.
-            limit: distance beyond which hits do not count, if less than the reach.
-        """
+        """Distance [R] to the first solid within reach, or ``limit`` if less (inf for none) and its row (-1), for rays
+        from origins [R, 3] in unit directions [R, 3]."""
         distance, row = np.full(len(directions), np.inf), np.full(len(directions), -1)
         if not len(directions) or not len(self.primitives):
             return distance, row
@@ -183,12 +168,8 @@ class Tracer:
 
 
 def box_distance(origins: Array, directions: Array, center: Array, half: Array, yaw: Array) -> Array:
-    """Distance [R] at which rays enter a box, each its own, inf where they miss it or start inside.
-
-    Args:
-        origins, directions: of the rays. [R, 3]
-        center, half, yaw: of the boxes, as in ``Primitives``; [R, 3], [R, 3] and [R].
-    """
+    """Distance [R] at which rays [R, 3] enter a box, each its own (as in ``Primitives``: [R, 3], [R, 3] and [R]), inf
+    where they miss it or start inside."""
     o, d = (origins - center).T, directions.T
     c, sn = np.cos(yaw), np.sin(yaw)
     enter, leave = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)

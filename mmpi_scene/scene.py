@@ -81,13 +81,8 @@ class Scene:
         return np.where(below, ground, distance), np.where(below, -1, row)
 
     def trace(self, origins: Array, directions: Array, pixel: float = 0.0) -> tuple[Array, Colors]:
-        """Distance [R] of what each ray meets first, inf for the sky, and its colour [R, 3] in [0, 1].
-
-        Args:
-            origins: [R, 3] metres.
-            directions: [R, 3] unit vectors.
-            pixel: angle that a ray stands for, radians; textures are averaged over it.
-        """
+        """Distance [R] of what each ray [R, 3] meets first, inf for the sky, and its colour [R, 3] in [0, 1], averaged
+        over the angle ``pixel`` that a ray stands for, radians."""
         distance, colors = np.empty(len(directions)), np.empty((len(directions), 3), np.float32)
         for start in range(0, len(directions), PACKET):
             s = slice(start, start + PACKET)
@@ -145,13 +140,8 @@ class Scene:
 
 
 def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array) -> tuple[Surface, Array]:
-    """Coordinates on the faces of the solids hit, and the normals [N, 3] there.
-
-    Args:
-        these: the solid that each point lies on.
-        points, directions: [N, 3] hits and the rays that met them.
-        pixel: width of a pixel at each point, across the ray. [N] metres
-    """
+    """Coordinates on the faces of the solids hit, and the normals [N, 3] there, of points on them [N, 3], the rays that
+    met them [N, 3], and the width of a pixel at each, across the ray. [N] metres"""
     n = np.arange(len(points))
     q, d = to_local(points - these.center, these.yaw), to_local(directions, these.yaw)
     h = these.half
@@ -187,11 +177,7 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
     """One image [H, W, 3] in [0, 1] and the exact distance [H, W] along the pixels' central rays, inf for the sky.
 
     Textures are averaged over the pixel, so one ray shows the inside of a face; pixels that differ from a neighbour
-    (another face, a shadow, another colour) are supersampled.
-
-    Args:
-        supersample: rays along each side of a pixel at such places.
-        contrast: difference of colour from which a pixel is supersampled; 0 supersamples all.
+    (another face, a shadow, another colour by ``contrast``, 0 for all) have ``supersample`` rays along each side.
     """
     cameras = scene.cameras
     h, w = cameras.height, cameras.width

@@ -43,15 +43,12 @@ class SfmPoints:
 
 
 def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: float = 0.02) -> SfmPoints:
-    """Points on what the cameras see, and who saw them where.
+    """Points on what the cameras see, and who saw them where; fewer than ``count`` where the cameras see too few from
+    enough sides. Raises ValueError if a number is out of range.
 
     Args:
-        count: number of points; fewer come back where the cameras see too few from enough sides.
         noise_pixels: standard deviation of the keypoints' noise along x and along y.
         outliers: share of the points that are wrong.
-
-    Raises:
-        ValueError: a number is out of range.
     """
     if count < 0 or noise_pixels < 0 or not 0 <= outliers < 1:
         raise ValueError(
@@ -130,11 +127,8 @@ def _tracked(scene: Scene, count: int, random: np.random.Generator) -> tuple:
 
 
 def _misled(scene: Scene, points: Array, tracks: tuple, pixel: Array, share: float, random: np.random.Generator):
-    """Moves a share of the points along a camera's ray, with keypoints that agree: what a repeated pattern does.
-
-    Returns:
-        Points [P, 3], which are outliers [P], which keypoints remain [Q] and where they are [Q, 2].
-    """
+    """Points [P, 3], of which a share was moved along a camera's ray, with keypoints that agree, as by a repeated
+    pattern; which those are [P], which keypoints remain [Q] and where [Q, 2]."""
     camera, point, exact = tracks
     moved, outlier, keep = points.copy(), np.zeros(len(points), bool), np.ones(len(point), bool)
     count = round(share * len(points))

@@ -12,16 +12,13 @@ from mmpi_scene.road import Road
 from mmpi_scene.scene import Light, Scene
 from mmpi_scene.surroundings import open_sky, street_ground
 
-CAMERA_HEIGHT = 1.65
 SUN = (-0.45, -0.4, 0.8)
-FOCAL_SHARE = 0.58
-"""Focal length as a share of the image width, as on KITTI."""
-EYE = 1.6
-"""Metres from the ground to the phone."""
+CAMERA_HEIGHT, EYE = 1.65, 1.6
+"""Metres from the ground to the camera of a car, and to the phone."""
+FOCAL_SHARE, PHONE_FOCAL_SHARE = 0.58, 0.76
+"""Focal length as a share of the image width, as on KITTI, and as of a phone's video."""
 PACE, STEPS = 1.3, 1.9
 """Metres and steps a second."""
-PHONE_FOCAL_SHARE = 0.76
-"""Focal length as a share of the image width, as of a phone's video."""
 LENS = (-0.11, 0.045, 0.0012, -0.0008)
 """k1, k2, p1, p2: pixels at the corners of a wide image are 4 % nearer to its middle than in a pinhole."""
 ASIDE, WEAVE = -2.2, 0.8

@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from training_runs import ready, trainer_config
 
 import mmpi_ns
-from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.rays import CameraRays
 from mmpi_ns.training.memory import Work, step_bytes
 
 WAITING = {
@@ -185,7 +185,7 @@ def waits_of_phases(scene, plan_file, folder, training, device, counted):
     reserved = step_bytes(model.progress.windows.plans[0], work)
     manager, found = trainer.pipeline.datamanager, {}
     del manager.train_ray_generator
-    manager.train_ray_generator = PinholeRays.of(manager.train_dataset.cameras, device)  # on a CPU as on a GPU
+    manager.train_ray_generator = CameraRays.of(manager.train_dataset.cameras, device)  # on a CPU as on a GPU
     schedule = trainer.pipeline.model.progress.schedule
     phases = [schedule.phase_at(step).name for step in range(STEPS)]
     for step, phase in enumerate(phases):

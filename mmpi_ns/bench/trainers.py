@@ -31,17 +31,8 @@ class Scene:
 def train_words(
     method: str, options: Sequence[str], scene: Scene, folder: Path, steps: int, seed: int, device: str
 ) -> list[str]:
-    """An ``ns-train`` line that leaves evaluating and saving to the caller: it saves once, at the end.
-
-    Args:
-        method: nerfstudio's name of it.
-        options: of the method; they come first, so that later words win.
-        scene: to train.
-        folder: of the run.
-        steps: of the run.
-        seed: of every random draw.
-        device: cpu or cuda.
-    """
+    """An ``ns-train`` line that leaves evaluating and saving to the caller: it saves once, at the end. The options of
+    the method come first, so that later words win."""
     words = [method, *options, "--machine.seed", str(seed)]
     words += ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
     words += ["--machine.device-type", device, "--max-num-iterations", str(steps), "--steps-per-save", str(10**9)]

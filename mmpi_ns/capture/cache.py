@@ -65,13 +65,8 @@ def held(
 ) -> Callable[[int], T]:
     """A function of an image's number that keeps its last results while neighbours are compared with them.
 
-    Threads that ask for the same image at once share one call.
-
-    Args:
-        function: of an image's number.
-        sizes: of the images [M, 2]; results are kept as long as they take ``HELD_BYTES`` at most.
-        bytes_of_pixel: that a result takes.
-        least: results that are kept at least: as many as an image is compared with.
+    Threads that ask for the same image at once share one call. Results of images of these sizes [M, 2] are kept as long
+    as they take ``HELD_BYTES`` at most, but ``least`` in any case: as many as an image is compared with.
     """
     bytes_of_image = bytes_of_pixel * float(sizes.prod(-1).max())
 
@@ -96,10 +91,7 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
     not kept. If several processes ask at once, one computes and the others wait. If the folder is not writable, every
     process computes the result itself, and says so.
 
-    Args:
-        key: of the result.
-        find: arrays by name; pairs that are computed one by one are written one by one.
-        folder: of the cache.
+    ``find`` gives arrays by name; pairs that are computed one by one are written one by one.
     """
     folder = folder or cache_folder()
     path = folder / f"{key}.npz"

@@ -8,7 +8,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,14 @@ from PIL import Image
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
+# Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
+UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
 FLOAT64_SAME = 1e-12
 """Cameras of a file closer together than this fraction of their distance from the origin count as one place."""
 ROTATION_SLACK = 0.01
 """Tolerance on the length of the axes of a pose, which should be 1."""
-FAR_OFF = 1000.0
-"""A camera this many times as far away as all but a few others is a mistake."""
-FEW = 0.1
-"""Fraction of the cameras that counts as a few."""
+FAR_OFF, FEW = 1000.0, 0.1
+"""A camera this many times as far away as all but a few others, this fraction of them, is a mistake."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 PATHS = ("file_path", "mask_path", "depth_file_path")
 PARSER_OPTIONS = {
@@ -64,16 +65,11 @@ STRETCH = 10.0
 
 
 def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Sequence[str], *, opens: bool) -> None:
-    """Reads a transforms.json and checks everything that nerfstudio's parser takes from it.
+    """Reads a transforms.json (in a folder, or a file of another name) and checks everything that nerfstudio's parser
+    takes from it, for the ``splits`` of train, val and test that will be requested.
 
-    Args:
-        parser: its settings.
-        data: folder with a transforms.json, or a file of that kind.
-        splits: those of train, val and test that will be requested.
-        opens: the parser takes its downscale factor from the first image, unless one is given, or from its copies.
-
-    Raises:
-        InputError: one sentence with the file, the frame if it is of one, and what to do.
+    Where it ``opens`` images, it takes its downscale factor from the first, unless one is given, or from its copies.
+    Raises InputError: one sentence with the file, the frame if it is of one, and what to do.
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
     meta, frames = _read(path)
@@ -92,19 +88,24 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
                 f"another --downscale-factor (there are {names_of_copies(path.parent)})."
             )
     elif opens:
-        try:
-            with Image.open(first):
-                pass
-        except (OSError, ValueError, Image.DecompressionBombError) as error:
-            raise InputError(
-                f"Image {first} cannot be read ({brief(error)}): repair it or remove its frame."
-            ) from error
+        with opened(first):
+            pass
     names = [str(frame["file_path"]) for frame in frames]
     check_places(poses[:, :3, 3], names, path, "nerfstudio-data", auto_scale=parser.auto_scale_poses)
     files = [str(frame[key]) for frame in frames for key in PATHS if key in frame]
     outside = [n for n in files if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
     if outside:
         say_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
+
+
+@contextmanager
+def opened(name: Path) -> Iterator[Image.Image]:
+    """An image file that is read within the block; InputError names it where that cannot be done."""
+    try:
+        with Image.open(name) as image:
+            yield image
+    except UNREADABLE as error:
+        raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.") from error
 
 
 def names_of_copies(folder: Path) -> str:
@@ -236,18 +237,8 @@ def _check_whole_file(
 def check_places(
     centers: NDArray[np.float64], names: Sequence[str], path: Path, parser: str, *, auto_scale: bool
 ) -> None:
-    """Camera positions [M, 3] in a file must differ, and none may be far from all others.
-
-    Args:
-        centers: the positions.
-        names: of the images.
-        path: the file or model, for the sentence.
-        parser: name of the data parser on the command line.
-        auto_scale: the parser divides by their extent.
-
-    Raises:
-        InputError: they do not.
-    """
+    """Raises InputError unless camera positions [M, 3] in a file or model differ, if the parser, by its name on the
+    command line, divides by their extent, and none is far from all others."""
     if np.ptp(centers, axis=0).max() <= FLOAT64_SAME * max(1.0, np.abs(centers).max()):
         if not auto_scale:
             return

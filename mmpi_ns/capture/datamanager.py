@@ -22,7 +22,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
+from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, opened, say_once
 from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
@@ -31,7 +31,7 @@ from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import drop_masked, observe, posed_images
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
 from mmpi_ns.capture.ray_sources import PixelPool, RaySources, rays_to_keypoints
-from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.rays import CameraRays
 from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -123,8 +123,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def create_train_dataset(self) -> MMPIDataset:
         # First, so that what is wrong with the test images is said before minutes of matching.
         self._test_images = super().create_eval_dataset()
-        if self.test_mode == "val":
-            self._test_images.check_files()
+        for name in self._test_images.image_filenames if self.test_mode == "val" else ():
+            with opened(name):
+                pass
         self.train_dataset = dataset = super().create_train_dataset()
         if min(int(dataset.cameras.width.min()), int(dataset.cameras.height.min())) < 1:
             raise InputError(
@@ -136,7 +137,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         device = self.device
-        generate = PinholeRays.of(dataset.cameras, device) or RayGenerator(dataset.cameras.to(device))
+        generate = CameraRays.of(dataset.cameras, device) or RayGenerator(dataset.cameras.to(device))
         self.train_ray_generator: Any = lambda pixels: generate(pixels.to(device))
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
             if self.config.mask_moving and None in dataset.mask_files:
@@ -208,11 +209,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return None if ratios is None else image_gains(ratios, len(posed.files), light)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
-        """Draws from these training cameras from now on, None for all, and prints the share of each source.
-
-        Raises:
-            InputError: an image cannot be used, or the masks leave no pixel.
-        """
+        """Draws from these training cameras from now on, None for all, and prints the share of each source. Raises
+        InputError if an image cannot be used, or the masks leave no pixel."""
         if self._resident is None:
             self.sources = None  # before the next pixels are read
             self.sources = self._read_sources(cameras)
@@ -336,7 +334,8 @@ def check_there(data: Path) -> None:
 def load_observations(
     data: Path, downscale_factor: int | None = None, parser: Parser = "auto", moving: Path | None = None
 ) -> tuple[Observations, str]:
-    """The observations that training on a scene would use, and a sentence on what moves in its images.
+    """The observations that training on a scene would use, and a sentence on what moves in its images. Raises
+    InputError if the folder holds no scene, or one that cannot be trained.
 
     Args:
         data: the scene's folder.
@@ -344,9 +343,6 @@ def load_observations(
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
         moving: file for a picture of what moves. None: neither movers nor depths of pixels are searched, which takes
             minutes; tracks or a plane sweep take their place.
-
-    Raises:
-        InputError: the folder holds no scene, or one that cannot be trained.
     """
     check_there(data)
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))

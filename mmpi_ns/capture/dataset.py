@@ -17,7 +17,6 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool
 from nerfstudio.data.dataparsers import nerfstudio_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
@@ -28,15 +27,13 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from mmpi_ns.capture.checks import check_places, names_of_copies, say_once
+from mmpi_ns.capture.checks import UNREADABLE, check_places, names_of_copies, opened, say_once
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.host import transforms_changed
 
-# Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
-UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
 SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 """Pillow's modes of gray images with up to 16 bits a pixel."""
 NO_MASK = "no mask"
@@ -81,34 +78,21 @@ class MMPIDataset(InputDataset):
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
-        name = self.image_filenames[image_idx]
-        try:
-            with Image.open(name) as image:  # gray, a palette, CMYK, 16 bits
-                if image.mode == "F":
-                    raise ValueError("its pixels are floating-point numbers")
-                if image.mode in SIXTEEN_BIT:
-                    deep = np.asarray(image).astype(np.int64)
-                    if deep.min() < 0 or deep.max() > 65535:
-                        raise ValueError("its pixels have more than 16 bits")
-                    gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
-                    pixels = np.repeat(gray[..., None], 3, axis=-1)
-                else:
-                    pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-        except UNREADABLE as error:
-            raise _unreadable(name, error) from error
+        with opened(self.image_filenames[image_idx]) as image:  # gray, a palette, CMYK, 16 bits
+            if image.mode == "F":
+                raise ValueError("its pixels are floating-point numbers")
+            if image.mode in SIXTEEN_BIT:
+                deep = np.asarray(image).astype(np.int64)
+                if deep.min() < 0 or deep.max() > 65535:
+                    raise ValueError("its pixels have more than 16 bits")
+                gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
+                pixels = np.repeat(gray[..., None], 3, axis=-1)
+            else:
+                pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         if self.scale_factor == 1.0:
             return pixels
         size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
         return np.array(Image.fromarray(pixels).resize(size, resample=Image.Resampling.BILINEAR))
-
-    def check_files(self) -> None:
-        """Raises InputError naming an image file that is missing or no image, by its first bytes alone."""
-        for name in self.image_filenames:
-            try:
-                with Image.open(name):
-                    pass
-            except UNREADABLE as error:
-                raise _unreadable(name, error) from error
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where any image has one."""
@@ -118,9 +102,17 @@ class MMPIDataset(InputDataset):
             data["mask"] = torch.from_numpy(self.usable(image_idx))[..., None]
         elif file is not None:
             try:
-                data["mask"] = mask = read_mask(file, self.scale_factor)
-                if mask.shape[:2] != shape:
-                    raise ValueError(f"it has {mask.shape[1]} x {mask.shape[0]} pixels")
+                with Image.open(file) as image:
+                    gray = image.convert("L") if image.mode == "P" else image  # the numbers of a palette are no shades
+                    if self.scale_factor != 1.0:
+                        width, height = (int(side * self.scale_factor) for side in gray.size)
+                        gray = gray.resize((width, height), resample=Image.Resampling.NEAREST)
+                    shades = np.array(gray)
+                if shades.ndim != 2:
+                    raise ValueError("it has several channels")
+                if shades.shape != shape:
+                    raise ValueError(f"it has {shades.shape[1]} x {shades.shape[0]} pixels")
+                data["mask"] = torch.from_numpy(shades != 0)[..., None]
             except UNREADABLE as error:
                 raise InputError(
                     f"Mask {file} cannot be used ({brief(error)}): give one channel of the image's size, white where "
@@ -158,32 +150,12 @@ class MMPIDataset(InputDataset):
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
 
 
-def _unreadable(name: Path, error: Exception) -> InputError:
-    return InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.")
-
-
-def read_mask(file: Path, scale: float) -> Bool[Tensor, "H W 1"]:
-    """Where a mask is not black, at a multiple of its size. Raises ValueError if it has colour channels."""
-    with Image.open(file) as image:
-        gray = image.convert("L") if image.mode == "P" else image  # the numbers of a palette are no shades
-        if scale != 1.0:
-            width, height = (int(side * scale) for side in gray.size)
-            gray = gray.resize((width, height), resample=Image.Resampling.NEAREST)
-        shades = np.array(gray)
-    if shades.ndim != 2:
-        raise ValueError("it has several channels")
-    return torch.from_numpy(shades != 0)[..., None]
-
-
 def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
     """Depths of a sensor along the optical axis [h, w], scene units; 0 where unknown.
 
     Args:
-        file: 16-bit PNG or .npy (nerfstudio's depth_file_path).
+        file: 16-bit PNG or .npy (nerfstudio's depth_file_path); InputError names one that holds something else.
         unit: scene units of a depth of 1 (nerfstudio's depth_unit_scale_factor).
-
-    Raises:
-        InputError: the file cannot be read or holds something else (names it).
     """
     try:
         is_array = file.suffix == ".npy"
@@ -382,17 +354,9 @@ def _points_or_none(*how: Any) -> dict[str, Tensor] | None:
 def parser_points(
     path: Path, transform_matrix: Tensor, scale_factor: float, origin: NDArray[np.float64] | float = 0.0
 ) -> dict[str, Tensor] | None:
-    """A point cloud as nerfstudio's data parser returns it; None if it holds no point.
-
-    Args:
-        path: PLY file.
-        transform_matrix: [3, 4], from the file's axes to the scene's.
-        scale_factor: of the scene.
-        origin: taken off the points before they are rounded to float32.
-
-    Raises:
-        InputError: it is no PLY file of points.
-    """
+    """The point cloud of a PLY file, moved to the scene's axes [3, 4] and scaled, as nerfstudio's data parser returns
+    it; None if it holds no point. ``origin`` is taken off before points are rounded to float32. Raises InputError if it
+    is no PLY file of points."""
     from plyfile import PlyData, PlyParseError  # slow to import; comes with nerfstudio's viewer
 
     try:

@@ -24,14 +24,11 @@ PIXELS = 4.0
 """Largest standard deviation of a blur in pixels; wider ones are computed on smaller images."""
 ENOUGH = 0.05
 """Smallest weighted fraction of known pixels around a pixel for which a plane is fitted."""
-LEAST_ERROR = 0.05
-"""Minimum relative error of an extrapolated distance."""
-MOST_ERROR = 0.3
-"""Extrapolated distances with a larger relative error are discarded."""
-NEAREST = 16
-"""Nearby images that are checked for a point."""
-MOST_OTHERS = 1
-"""Other images in which a lone point may lie; with more, matches and colours are more reliable."""
+LEAST_ERROR, MOST_ERROR = 0.05, 0.3
+"""Minimum relative error of an extrapolated distance, and the error above which it is discarded."""
+NEAREST, MOST_OTHERS = 16, 1
+"""Nearby images that are checked for a point, and those in which a lone one may lie; with more, matches and colours are
+more reliable."""
 
 
 def continued(depths: Map, directions: Map) -> Map:

@@ -44,18 +44,16 @@ THUMBNAIL = 128
 """Maximum pixels along a side of the gray images for the plane sweep, box-filtered."""
 ENOUGH_KEYPOINTS = 20
 """Average number of keypoints in an image above which no plane sweep is needed."""
-CELLS = 48
-"""Cells of a coarse depth image along the longer side."""
-BEHIND = 1.15
-"""A point farther away than the nearest one around it by this factor is hidden."""
+CELLS, BEHIND = 48, 1.15
+"""Cells of a coarse depth image along the longer side; a point farther away than the nearest one around it by this
+factor is hidden."""
 POINT_ERROR = 0.01
 """Minimum relative error of the distance of a point."""
 CONTRADICTS = 6.0
 """Difference of two sources, in expected errors of both, from which one of them is wrong."""
-MOST_POINTS = 100_000
-"""Points that are used of a larger cloud, such as a laser scan's."""
-FARTHEST = 1e5
-"""Distance of a point from the cameras, over their own extent, from which it is a mistake."""
+MOST_POINTS, FARTHEST = 100_000, 1e5
+"""Points that are used of a larger cloud, such as a laser scan's; distance of one from the cameras, over their own
+extent, from which it is a mistake."""
 
 
 def observe(
@@ -67,18 +65,13 @@ def observe(
     find_points: bool,
     triangulates: bool,
 ) -> Observations:
-    """The observations of a training data set.
+    """The observations of a training data set. Raises InputError for poses or intrinsics that cannot be used.
 
     Args:
-        outputs: data parser outputs of the training images.
-        dataset: the training images.
+        outputs, dataset: the training images, as the data parser lists them and as they are read.
         parser: settings of the data parser, whose COLMAP model is read if it has one.
         sfm_path: of a COLMAP model beside the frames otherwise; it need not exist.
-        find_points: search the images for points if there are no tracks.
-        triangulates: match features for this before a plane sweep.
-
-    Raises:
-        InputError: poses or intrinsics that cannot be used.
+        find_points, triangulates: search the images for points if there are no tracks; first by matched features.
     """
     data = Path(parser.data)
     folder = data.parent if data.suffix == ".json" else data
@@ -146,11 +139,8 @@ def tell_poses(off: float, image: Path) -> None:
 
 
 def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
-    """Training cameras as they are used, with the SfM points and keypoints moved into their frame.
-
-    Raises:
-        InputError: poses are missing, or poses or intrinsics cannot be used; names the image.
-    """
+    """Training cameras as they are used, with the SfM points and keypoints moved into their frame. Raises InputError
+    naming the image whose pose or intrinsics cannot be used."""
     if not len(outputs.image_filenames):
         raise InputError("The capture holds no training image: check the split that the data parser made.")
     poses = np.array(cameras.camera_to_worlds.double().cpu())
@@ -253,14 +243,8 @@ def contradict(a: Map, b: Map) -> NDArray[np.bool_]:
 
 
 def usable_points(points: Array, centers: Array) -> Array:
-    """The points of a cloud [P, 3] that can be used, a random subset of ``MOST_POINTS`` if there are more.
-
-    Says how many are NaN or absurdly far away.
-
-    Args:
-        points: in scene units.
-        centers: of the cameras. [M, 3]
-    """
+    """The points of a cloud [P, 3] that can be used, a random subset of ``MOST_POINTS`` if there are more; says how
+    many are NaN or absurdly far away from the cameras [M, 3]."""
     middle = np.median(centers, axis=0)
     extent = float(np.ptp(centers, axis=0).max())
     with np.errstate(invalid="ignore"):
@@ -331,13 +315,8 @@ class Sightings:
 
 
 def see_points(points: Array, posed: PosedImages, depths: Callable[[int], Map] | None = None) -> Sightings:
-    """Sightings of points [P, 3] in the training images.
-
-    Args:
-        points: in scene units.
-        posed: the images.
-        depths: known inverse distances and their errors for an image, 0 where unknown. [H, W, 2]
-    """
+    """Sightings of points [P, 3] in the training images; ``depths`` are an image's known inverse distances and their
+    errors, 0 where unknown. [H, W, 2]"""
     seen: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
     confirmed, contradicted = np.zeros((2, len(points)), np.int64)
     for i, size in enumerate(posed.sizes):

@@ -229,14 +229,9 @@ def color_ratios(
     image_of: Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8]]],
     seed: int = 0,
 ) -> ColorRatios | None:
-    """Colours of the same surfaces in each image and its nearest views; None if none show the same.
+    """Colours of the same surfaces in each training image and its nearest views; None if none show the same.
 
-    Args:
-        cameras: of the training images.
-        depths: of their pixels.
-        rays: makes rays through pixel centres (image, row, column).
-        image_of: colours [H, W, C] of an image, and where it may be used [H, W].
-        seed: of the draw of pixels.
+    ``image_of`` gives the colours [H, W, C] of an image, and where it may be used [H, W]; ``seed`` draws pixels.
     """
     view_of = held(
         lambda i: ExposedView.of(*image_of(i), depths.image(i), i), cameras.sizes, BYTES_OF_VIEW, NEIGHBOURS + 1
@@ -321,13 +316,9 @@ def exposure_of_view(
     """Exposure of an image that was not calibrated, by what it and calibrated images show; None if they show nothing.
 
     Args:
-        view: the image.
-        others: calibrated images nearby.
-        cameras: of the calibrated images.
-        pixels: row and column of some of the image's pixels.
-        points: the surfaces that they show.
-        exposures: of the calibrated images.
-        falloff: towards the corners.
+        view, others: the image, and calibrated ones nearby.
+        cameras, exposures, falloff: of the calibrated images.
+        pixels, points: row and column of some of the image's pixels, and the surfaces that they show.
     """
     parts = [pair_ratios(view, other, cameras, pixels, points) for other in others]
     ratios = [part for part in parts if part is not None]

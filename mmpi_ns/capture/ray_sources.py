@@ -61,18 +61,10 @@ class PixelPool:
         most: int,
         seed: int,
     ) -> PixelPool:
-        """Reads images once; masked pixels are left out.
+        """Reads some training images once; masked pixels are left out.
 
-        Args:
-            dataset: the training images.
-            device: of the pixels.
-            images: which of them.
-            known_depth: their depths, if any are known.
-            most: maximum number of pixels; beyond it, a random subset, the same fraction of each image. 0: no limit.
-            seed: of the subset.
-
-        Raises:
-            InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
+        Of more than ``most`` pixels, unless that is 0, a random subset is read, the same fraction of each image. Raises
+        InputError naming an image or mask that cannot be used, or if the masks leave nothing.
         """
         widths, heights = (x.reshape(-1).tolist() for x in (dataset.cameras.width, dataset.cameras.height))
         sizes = [widths[i] * heights[i] for i in images]
@@ -110,12 +102,7 @@ class PixelPool:
     def draw(
         self, count: int, g: torch.Generator
     ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
-        """Colours, (image, row, column) and depths of random pixels.
-
-        Args:
-            count: R.
-            g: draws them.
-        """
+        """Colours, (image, row, column) and depths of ``count`` random pixels."""
         after = (self.ends - self.begins).cumsum(0)
         drawn = torch.randint(self.count, (count,), generator=g, device=g.device).to(self.colors.device)
         which = torch.searchsorted(after, drawn, right=True)
@@ -226,12 +213,7 @@ class RaySources:
     def draw(
         self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
     ) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Rays of pixels, of new views and of keypoints, in this order, and what the images say of them.
-
-        Args:
-            pixel_rays: rays through pixels.
-            g: draws them.
-            pixels_alone: without new views and keypoints.
+        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and what images say of them.
 
         Returns:
             The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH, OWN_PIXEL and EXPOSURE in their metadata. The batch: ``image``,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -38,25 +38,25 @@ BENT = (CameraType.FISHEYE, CameraType.FISHEYE624, CameraType.EQUIRECTANGULAR)
 
 
 @dataclass(frozen=True)
-class PinholeRays:
-    """Takes the place of nerfstudio's ``RayGenerator`` for N perspective cameras without a lens."""
+class CameraRays:
+    """Takes the place of nerfstudio's ``RayGenerator`` for N perspective and fisheye cameras."""
 
     poses: Float[Tensor, "N 3 4"]
     focal: Float[Tensor, "N 2"]
     principal: Float[Tensor, "N 2"]
+    lenses: tuple[Float[Tensor, "T 3"], Int[Tensor, "N"], Int[Tensor, "N"]] | None = field(default=None, kw_only=True)
+    """Directions of the pixels of all distinct cameras, in their axes; the row of each camera's first pixel there, and
+    the width of its image. None if all are pinholes."""
 
     @staticmethod
-    def of(cameras: Cameras, device: torch.device | str) -> PinholeRays | None:
-        """Rays of perspective and fisheye cameras, ``LensRays`` if any has a lens.
-
-        None if a camera has another type or a time, or if several lenses have more pixels than ``MOST_DIRECTIONS``.
-        """
+    def of(cameras: Cameras, device: torch.device | str) -> CameraRays | None:
+        """None if a camera has another type or a time, or if several lenses have more pixels than MOST_DIRECTIONS."""
         kinds = cameras.camera_type.reshape(-1)
         is_fisheye = kinds == CameraType.FISHEYE.value
         if cameras.times is not None or not bool((is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all()):
             return None
         focal, principal = torch.cat([cameras.fx, cameras.fy], -1), torch.cat([cameras.cx, cameras.cy], -1)
-        pinholes = PinholeRays(*(x.to(device, torch.float32) for x in (cameras.camera_to_worlds, focal, principal)))
+        pinholes = CameraRays(*(x.to(device, torch.float32) for x in (cameras.camera_to_worlds, focal, principal)))
         lens = cameras.distortion_params
         if not bool(is_fisheye.any()) and (lens is None or not bool((lens != 0).any())):
             return pinholes
@@ -69,27 +69,23 @@ class PinholeRays:
             return None
         tables = [pixel_directions(tuple(row)) for row in distinct.tolist()]
         directions = torch.cat(tables) if len(tables) > 1 else tables[0]  # without a copy
-        lenses = directions, (pixels.cumsum(0) - pixels)[which], distinct[which, 4].long()
-        return LensRays(*vars(pinholes).values(), *(x.to(device) for x in lenses))
+        first, widths = (pixels.cumsum(0) - pixels)[which], distinct[which, 4].long()
+        return replace(pinholes, lenses=(directions.to(device), first.to(device), widths.to(device)))
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
-        """Rays through pixel centres. Pixel areas are those at distance 1; of a lens, those at its centre.
-
-        Args:
-            ray_indices: camera, row and column of each.
-        """
-        camera = ray_indices[:, 0]
+        """Rays through pixel centres (camera, row, column). Pixel areas are those at distance 1; of a lens, those at
+        its centre."""
+        camera, row, column = ray_indices.unbind(-1)
         poses = self.poses[camera]
-        local = self.local(ray_indices)
+        if self.lenses is None:
+            u, v = ((ray_indices[:, 1:].flip(-1) + 0.5 - self.principal[camera]) / self.focal[camera]).unbind(-1)
+            local = torch.stack([u, -v, -torch.ones_like(u)], -1)
+        else:
+            directions, first, widths = self.lenses
+            local = directions[first[camera] + row * widths[camera] + column]
         directions = torch.nn.functional.normalize(rotate(poses[:, :, :3], local), dim=-1)
         area = 1 / (self.focal[camera].prod(-1, keepdim=True) * local.square().sum(-1, keepdim=True))
         return RayBundle(poses[:, :, 3], directions, pixel_area=area, camera_indices=camera[:, None], metadata={})
-
-    def local(self, ray_indices: Int[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-        """Directions in the axes of the cameras: right, up, backwards."""
-        camera, pixel = ray_indices[:, 0], ray_indices[:, 1:].flip(-1) + 0.5
-        u, v = ((pixel - self.principal[camera]) / self.focal[camera]).unbind(-1)
-        return torch.stack([u, -v, -torch.ones_like(u)], -1)
 
     def image(self, height: int, width: int, step: int = 1) -> RayBundle:
         """Rays [H, W] through all pixels of the first camera, or through those of every n-th row and column."""
@@ -103,26 +99,9 @@ class PinholeRays:
         return RayBundle(**joined, metadata={}).reshape((len(rows), len(columns)))
 
 
-@dataclass(frozen=True)
-class LensRays(PinholeRays):
-    """The same for cameras with a lens, from a table of the directions of every pixel."""
-
-    directions: Float[Tensor, "T 3"]
-    """Directions of the pixels of all distinct cameras, in their axes."""
-    first: Int[Tensor, "N"]
-    """Row of each camera's first pixel in the table."""
-    widths: Int[Tensor, "N"]
-    """Widths of the images, pixels."""
-
-    def local(self, ray_indices: Int[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-        """Directions in the axes of the cameras: right, up, backwards."""
-        camera, row, column = ray_indices.unbind(-1)
-        return self.directions[self.first[camera] + row * self.widths[camera] + column]
-
-
 def image_rays(camera: Cameras, step: int = 1) -> RayBundle:
-    """Rays [H, W] through the pixels of one camera, as of ``PinholeRays.image``; nerfstudio's for other types."""
-    rays = PinholeRays.of(camera, camera.device)
+    """Rays [H, W] through the pixels of one camera, as of ``CameraRays.image``; nerfstudio's for other types."""
+    rays = CameraRays.of(camera, camera.device)
     if rays is None:
         return camera.generate_rays(0, keep_shape=True)[::step, ::step]
     return rays.image(int(camera.height), int(camera.width), step)

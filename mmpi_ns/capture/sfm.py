@@ -1,17 +1,19 @@
-"""COLMAP models: points, and which image saw which point at which pixel."""
+"""COLMAP models: points, and which image saw which point at which pixel, read from files or made with given poses: from
+features and matches in one database, for training and ``mmpi-prepare``."""
 
 from __future__ import annotations
 
 import signal
 import struct
+import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +25,15 @@ if TYPE_CHECKING:
 
 OLDEST_PYCOLMAP = 4
 """First major version with the functions that this package calls."""
-MIN_TRACK = 3
-"""Points seen by fewer images are too uncertain to supervise depth."""
-MAX_ERROR_PX = 2.0
-"""Points with a larger mean reprojection error are left out."""
+MIN_TRACK, MAX_ERROR_PX = 3, 2.0
+"""Points seen by fewer images, or with a larger mean reprojection error, are too uncertain to supervise depth."""
 PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 16)
 """Parameters of COLMAP's camera models, by model number."""
+MIN_ANGLE = 0.5
+"""Minimum angle in degrees between the rays of a point; driving forward gives little more."""
+MIN_INLIERS = 15
+"""Minimum number of matches of a pair: COLMAP's own limit."""
+SEED = 0
 KEYPOINT = np.dtype([("place", "<f8", 2), ("point", "<u8")])
 NO_POINT = np.uint64(2**64 - 1)
 
@@ -73,11 +78,7 @@ def checked_model(path: Path) -> Iterator[None]:
 
 def load_pycolmap() -> ModuleType:
     """pycolmap, which is slow to import. SIGTERM stays as it was: glog's handler prints a stack trace and may wait for
-    ever.
-
-    Raises:
-        InputError: pycolmap is too old.
-    """
+    ever. Raises InputError if pycolmap is too old."""
     handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
@@ -117,22 +118,15 @@ def numbers_in_model(files: Sequence[Path], names: Sequence[str]) -> NDArray[np.
     Without one, a file name that the model has once will do, as images may have been moved. Cameras of a rig have files
     of the same names in their folders: a model's image that several files would be is none of them.
 
-    Args:
-        files: paths of image files.
-        names: of the model's images.
-
-    Returns:
-        Numbers in ``names``, -1 where none fits. [F]
+    Returns numbers in ``names``, those of the model's images, -1 where none fits. [F]
     """
     whole = {name: m for m, name in enumerate(names)}
     often = Counter(Path(name).name for name in names)
     moved = {Path(name).name: m for m, name in enumerate(names) if often[Path(name).name] == 1}
-
-    def number(file: Path) -> int:
+    numbers = {}
+    for file in map(Path, files):
         endings = ("/".join(file.parts[i:]) for i in range(len(file.parts)))
-        return next((whole[ending] for ending in endings if ending in whole), moved.get(file.name, -1))
-
-    numbers = {file: number(file) for file in map(Path, files)}
+        numbers[file] = next((whole[ending] for ending in endings if ending in whole), moved.get(file.name, -1))
     claims = Counter(numbers.values())
     return np.array([numbers[file] if claims[numbers[file]] == 1 else -1 for file in map(Path, files)], np.int64)
 
@@ -144,15 +138,12 @@ class _Reader:
         self.name, self.data, self.at = path.name, path.read_bytes(), 0
         self.records = self.count(least)
 
-    def skip(self, size: int) -> int:
-        """Skips bytes and returns the place of the first."""
-        self.at += size
+    def take(self, form: str) -> tuple:
+        """The next numbers, of this form of ``struct``."""
+        begin, self.at = self.at, self.at + struct.calcsize(form)
         if self.at > len(self.data):
             raise ValueError(f"{self.name} ends too early, after {len(self.data)} bytes")
-        return self.at - size
-
-    def take(self, form: str) -> tuple:
-        return struct.unpack_from(form, self.data, self.skip(struct.calcsize(form)))
+        return struct.unpack_from(form, self.data, begin)
 
     def count(self, least: int) -> int:
         """A number of records of at least this many bytes each, which must fit into the rest of the file."""
@@ -172,7 +163,7 @@ def _check_binary_files(folder: Path) -> None:
         number, model, _, _ = files[0].take("<IiQQ")
         if not 0 <= model < len(PARAMETERS):
             raise ValueError(f"cameras.bin has a camera of model {model}, which is not known")
-        files[0].skip(8 * PARAMETERS[model])
+        files[0].take(f"{8 * PARAMETERS[model]}x")
         cameras.add(number)
     for _ in range(files[1].records):
         number, *_, camera = files[1].take("<I7dI")
@@ -183,12 +174,12 @@ def _check_binary_files(folder: Path) -> None:
             raise ValueError("images.bin ends within a name")
         files[1].at = end + 1
         images[number] = files[1].count(24)
-        begin = files[1].skip(24 * images[number])
+        begin, _ = files[1].at, files[1].take(f"{24 * images[number]}x")
         seen.append(np.frombuffer(files[1].data, KEYPOINT, images[number], begin)["point"])
     for _ in range(files[2].records):
         points.add(files[2].take("<Q3d3Bd")[0])
-        begin = files[2].skip(8 * files[2].count(8))
-        for image, keypoint in struct.iter_unpack("<II", files[2].data[begin : files[2].at]):
+        (track,) = files[2].take(f"{8 * files[2].count(8)}s")
+        for image, keypoint in struct.iter_unpack("<II", track):
             if keypoint >= images.get(image, 0):
                 raise ValueError(f"points3D.bin names keypoint {keypoint} of image {image}, which images.bin has not")
     for file in files:
@@ -197,3 +188,127 @@ def _check_binary_files(folder: Path) -> None:
     lost = set(np.unique(np.concatenate(seen)).tolist()) - {int(NO_POINT)} - points
     if lost:
         raise ValueError(f"images.bin names point {min(lost)}, which points3D.bin has not")
+
+
+@contextmanager
+def quiet(shows_errors: bool = True) -> Iterator[None]:
+    """Keeps COLMAP's log to errors, or to what ends the program."""
+    log = load_pycolmap().logging
+    level, log.minloglevel = log.minloglevel, int(log.Level.ERROR if shows_errors else log.Level.FATAL)
+    try:
+        yield
+    finally:
+        log.minloglevel = level
+
+
+def rigid3d(camera_to_world: NDArray[np.float64]) -> Any:
+    """World to camera, as COLMAP has it, of a pose with OpenCV axes. [3, 4] or [4, 4]"""
+    pycolmap, rotation = load_pycolmap(), camera_to_world[:3, :3]
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation.T), -rotation.T @ camera_to_world[:3, 3])
+
+
+def new_model(
+    cameras: Iterable[Any], names: Sequence[str], camera_ids: Sequence[int], poses: Mapping[str, Any] | None = None
+) -> Any:
+    """A reconstruction without points: image i has id i + 1. With poses (by name), only the images that have one."""
+    pycolmap = load_pycolmap()
+    model = pycolmap.Reconstruction()
+    for camera in cameras:
+        model.add_camera_with_trivial_rig(camera)
+    for i, (name, camera_id) in enumerate(zip(names, camera_ids, strict=True)):
+        image = pycolmap.Image(name=name, camera_id=camera_id, image_id=i + 1)
+        if poses is None:
+            model.add_image_with_trivial_frame(image)
+        elif name in poses:
+            model.add_image_with_trivial_frame(image, poses[name])
+    return model
+
+
+def write_images(model: Any, database: Path) -> None:
+    """Writes cameras and images of a model to a new database; features keep these ids, whatever the threads do."""
+    with load_pycolmap().Database.open(database) as opened:
+        for _, camera in sorted(model.cameras.items()):
+            opened.write_camera(camera, use_camera_id=True)
+        for _, rig in sorted(model.rigs.items()):
+            opened.write_rig(rig, use_rig_id=True)
+        for _, image in sorted(model.images.items()):
+            opened.write_frame(model.frames[image.frame_id], use_frame_id=True)
+            opened.write_image(image, use_image_id=True)
+
+
+def find_features(database: Path, images: Path, names: Sequence[str], options: Any, masks: Path | None = None) -> None:
+    """SIFT features of images below a folder that the database lists, but for images that have theirs; none where masks
+    (``NAME.png``) are black. ``options`` are pycolmap's."""
+    pycolmap = load_pycolmap()
+    reader = pycolmap.ImageReaderOptions()
+    if masks is not None:
+        reader.mask_path = masks
+    pycolmap.extract_features(
+        database, images, image_names=list(names), reader_options=reader, extraction_options=options
+    )
+
+
+def count_features(database: Path) -> list[int | None]:
+    """Number of features of each image by id; None of an image that could not be read."""
+    with load_pycolmap().Database.open(database) as opened:
+        ids = sorted(image.image_id for image in opened.read_all_images())
+        return [opened.num_keypoints_for_image(i) if opened.exists_keypoints(i) else None for i in ids]
+
+
+def match_pairs(
+    database: Path, pairs: Iterable[tuple[str, str]], threads: int = -1, guided: bool = False, least: int = MIN_INLIERS
+) -> None:
+    """Matches and verifies pairs of images, by name, in a database of their features, unless it has their matches.
+
+    ``guided`` matches a pair again along the epipolar lines of its first matches; ``least`` is the minimum of inliers.
+    """
+    pycolmap = load_pycolmap()
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.guided_matching, matching.num_threads = guided, threads
+    verification.ransac.random_seed, verification.min_num_inliers = SEED, least
+    pairing = pycolmap.ImportedPairingOptions()
+    with tempfile.TemporaryDirectory(prefix="mmpi-pairs-") as folder:
+        pairing.match_list_path = listing = Path(folder) / "pairs.txt"
+        listing.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+        options = {"matching_options": matching, "pairing_options": pairing, "verification_options": verification}
+        pycolmap.match_image_pairs(database, **options)
+
+
+def verified_matches(database: Path) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+    """(image, image, keypoints [N, 2] of both) of every pair of images with verified matches; images by their ids."""
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database) as opened:
+        pairs, geometries = opened.read_two_view_geometries()
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        yield *pycolmap.pair_id_to_image_pair(pair), np.asarray(geometry.inlier_matches).astype(int).reshape(-1, 2)
+
+
+def triangulate_points(
+    model: Any, database: Path, images: Path, threads: int = -1, max_error: float = 4.0, pairs_alone: bool = False
+) -> Any:
+    """Points of a reconstruction's posed images from their verified matches; cameras and poses stay.
+
+    ``max_error`` is a point's largest reprojection error, in pixels; ``pairs_alone`` takes points of two images, too.
+    """
+    pycolmap = load_pycolmap()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = options.triangulation.random_seed = SEED
+    options.num_threads = options.mapper.num_threads = threads
+    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_ANGLE
+    options.triangulation.ignore_two_view_tracks = not pairs_alone
+    options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
+    options.mapper.filter_max_reproj_error = max_error
+    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    with tempfile.TemporaryDirectory(prefix="mmpi-points-") as unread:
+        return pycolmap.triangulate_points(model, database, images, unread, clear_points=True, options=options)
+
+
+def epipolar_distances(
+    model: Any, first: int, second: int, rays: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Sampson distances [M] of matches from the epipolar lines of the poses of two images, by their ids, over the focal
+    length; ``rays`` are the matched keypoints of each image in the plane z = 1. [M, 2]"""
+    pycolmap = load_pycolmap()
+    relative = model.images[second].cam_from_world() * model.images[first].cam_from_world().inverse()
+    essential = pycolmap.essential_matrix_from_pose(relative)
+    return np.sqrt(pycolmap.compute_squared_sampson_error(*rays, essential))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.capture import matching
+from mmpi_ns.capture import sfm
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, brief
@@ -98,14 +98,8 @@ def shown_size(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArra
 def whole_of(file: Path, size: NDArray[np.float64]) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
     """What a downscaled copy was made from, its size, and its pixels (columns, rows) in one of the copy.
 
-    A file without an original, or whose original has another shape, stands for itself.
-
-    Args:
-        file: the copy.
-        size: its width and height.
-
-    Raises:
-        InputError: an image file cannot be read (names it).
+    A file, of this width and height, without an original, or whose original has another shape, stands for itself.
+    Raises InputError naming an image file that cannot be read.
     """
     original, factor = original_of(file)
     if factor > 1:
@@ -138,10 +132,7 @@ def _is_cut(folder: Path) -> bool:
 
 def at_full_size(images: PosedImages) -> PosedImages:
     """The same views in their originals, which are sharper; a view whose original has another shape stays as it is.
-
-    Raises:
-        InputError: an image file cannot be read (names it).
-    """
+    Raises InputError naming an image file that cannot be read."""
     copies = [size_of(file) for file in images.files]
     files, sizes, scales = zip(*map(whole_of, images.files, copies), strict=True)
     reduced = np.stack(copies) / [shown_size(*pair) for pair in zip(copies, images.sizes, strict=True)]
@@ -150,12 +141,8 @@ def at_full_size(images: PosedImages) -> PosedImages:
 
 
 def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
-    """Pairs (i, j) with i < j, in order, of each camera with its nearest ones that have a similar viewing direction.
-
-    Args:
-        camera_to_worlds: poses. [M, 3, 4]
-        neighbours: maximum number of cameras chosen by each.
-    """
+    """Pairs (i, j) with i < j, in order, of each camera, by poses [M, 3, 4], with its nearest ones that have a similar
+    viewing direction, ``neighbours`` at most."""
     near = [
         nearest_views(camera_to_worlds, i, neighbours, MAX_ANGLE, apart=False) for i in range(len(camera_to_worlds))
     ]
@@ -163,21 +150,13 @@ def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[t
 
 
 def triangulate(images: PosedImages) -> SfmModel:
-    """Points seen in several images, and their keypoints.
+    """Points seen in several images, in the frame of their poses, and their keypoints; images are named by their
+    indices.
 
-    Deterministic for equal images and poses. A quick search is followed by a thorough one if it finds too little.
-    The quick search takes about a third of a second for each image on one core, the thorough one a second.
-
-    Args:
-        images: image files with their cameras, whose poses are in any one frame.
-
-    Returns:
-        Points in the frame of the poses; none if nothing matches. Image names are their indices in ``images``.
-
-    Raises:
-        InputError: an image file cannot be read.
-    """
-    with matching.quiet():
+    Deterministic for equal images and poses. A quick search is followed by a thorough one if it finds too little. The
+    quick search takes about a third of a second for each image on one core, the thorough one a second. Raises
+    InputError if an image file cannot be read."""
+    with sfm.quiet():
         for effort in EFFORTS[:-1]:
             tracks = _attempt(images, effort)
             if len(tracks.seen_by) >= ENOUGH * len(images.files):
@@ -203,22 +182,22 @@ def _attempt(images: PosedImages, effort: tuple[float, bool, int]) -> SfmModel:
             camera.has_prior_focal_length = True
             cameras.append(camera)
         opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
-        poses = dict(zip(names, map(matching.rigid3d, opencv), strict=True))
-        model = matching.new_model(cameras, names, range(1, len(names) + 1), poses)
-        matching.write_images(model, database)
+        poses = dict(zip(names, map(sfm.rigid3d, opencv), strict=True))
+        model = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
+        sfm.write_images(model, database)
         options = pycolmap.FeatureExtractionOptions()
         options.max_image_size = LARGE
         options.sift.first_octave = -1 if images.sizes.max() <= SMALL else 0
         options.sift.peak_threshold = peak_threshold
-        matching.find_features(database, work, names, options)
-        for file, features in zip(images.files, matching.count_features(database), strict=True):
+        sfm.find_features(database, work, names, options)
+        for file, features in zip(images.files, sfm.count_features(database), strict=True):
             if features is None:
                 raise InputError(f"Training image {file} cannot be read: repair or remove it.")
         if pairs:
             named = [(names[i], names[j]) for i, j in pairs]
-            matching.match_pairs(database, named, guided=guided, least=least)
+            sfm.match_pairs(database, named, guided=guided, least=least)
             error = _epipolar_error(database, model)
-            model = matching.triangulate_points(model, database, work, pairs_alone=True)
+            model = sfm.triangulate_points(model, database, work, pairs_alone=True)
         tracks = read_reconstruction(model, MIN_TRACK)
         return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
 
@@ -236,9 +215,9 @@ def _epipolar_error(database: Path, model: Any) -> float:
     rays = {i: np.asarray(cameras[i].cam_from_img(points)) for i, points in keypoints.items()}
     centers = {i: image.projection_center() for i, image in model.images.items()}
     least = SAME_PLACE * max(1.0, float(np.abs(list(centers.values())).max()))
-    for a, b, matches in matching.verified_matches(database):
+    for a, b, matches in sfm.verified_matches(database):
         if np.linalg.norm(centers[a] - centers[b]) <= least:
             continue
-        distance = matching.epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
+        distance = sfm.epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
         distances.append(distance * cameras[a].mean_focal_length() / cameras[a].width)
     return float(np.median(np.concatenate(distances))) if sum(map(len, distances)) else np.nan

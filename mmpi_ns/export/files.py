@@ -20,7 +20,7 @@ from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.rays import CameraRays
 from mmpi_ns.export.codes import coarse_differences, joined_codes, split_codes
 from mmpi_ns.export.details import STEP, StoredView, cameras_of, restored_view
 from mmpi_ns.rendering.baked import BakedWindow
@@ -60,7 +60,7 @@ class Pose:
     def rays(self) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
         """Origins and unit directions through the centres of all pixels, row by row."""
         matrices = (torch.tensor(x, dtype=torch.float32)[None] for x in (self.to_world, self.focal, self.center))
-        bundle = PinholeRays(*matrices).image(self.size[1], self.size[0]).flatten()
+        bundle = CameraRays(*matrices).image(self.size[1], self.size[0]).flatten()
         return bundle.origins.contiguous(), bundle.directions.contiguous()
 
 

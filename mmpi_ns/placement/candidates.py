@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.errors import cube_errors, pixel_slopes
-from mmpi_ns.placement.hand_made import facing_axes, vector
-from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import VisiblePoints, farthest_first
-from mmpi_ns.scene.plan import CubePlan, MPIPlan
+from mmpi_ns.placement.observations import Array, Observations, VisiblePoints, farthest_first
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, Vector
 from mmpi_ns.utils.errors import InputError
 
 MAX_VIEWS, MAX_WIDE_VIEWS = 96, 32
@@ -35,6 +33,24 @@ NEAR_SHARE = 0.6
 """First plane, relative to where points start."""
 CUBE_SIZES = (0.4, 0.7, 1.0)
 """Half a cube's side, relative to the cameras' distance from what they look at."""
+
+
+def vector(v: Array) -> Vector:
+    return (float(v[0]), float(v[1]), float(v[2]))
+
+
+def facing_axes(base: Array, name: str) -> tuple[Vector, Vector, Vector]:
+    """Rows x, y, z of an MPI that faces ``name`` in a frame with rows right, down, forward."""
+    right, down, forward = base
+    x, y, z = {
+        "front": (right, down, forward),
+        "back": (-right, down, -forward),
+        "left": (forward, down, -right),
+        "right": (-forward, down, right),
+        "below": (right, -forward, down),
+        "above": (right, forward, -down),
+    }[name]
+    return vector(x), vector(y), vector(z)
 
 
 @dataclass(frozen=True)
@@ -61,11 +77,8 @@ class Candidate:
 
 
 def find_candidates(observations: Observations, visible: VisiblePoints, with_cubes: bool) -> list[Candidate]:
-    """Views of training cameras that are spread over the capture, and cubes.
-
-    Raises:
-        InputError: no camera has a field of view that an MPI can have.
-    """
+    """Views of training cameras that are spread over the capture, and cubes. Raises InputError if no camera has a field
+    of view that an MPI can have."""
     centers, back = observations.centers / max(visible.near, 1e-12), observations.camera_to_worlds[:, :, 2]
     places = np.concatenate([centers, back * 2], -1)
     most, candidates = MAX_WIDE_VIEWS if observations.wide.any() else MAX_VIEWS, []

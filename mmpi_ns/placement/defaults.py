@@ -38,56 +38,32 @@ images as good, in an eighth worse ones (docs/log/performance.md)."""
 POSITIVE, NOT_NEGATIVE = Number(0, above=True), Number(0)
 RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),
-    "max_texels": NOT_NEGATIVE,
-    "min_gain": NOT_NEGATIVE,
-    "planes": Number(2, MOST_PLANES, whole=True),
-    "max_planes": Number(2, MOST_PLANES, whole=True),
-    "plane_pixels": POSITIVE,
-    "texel_pixels": POSITIVE,
-    "rays_per_texel": NOT_NEGATIVE,
-    "texels_per_ray": NOT_NEGATIVE,
-    "height": Number(2, MOST_TEXELS, whole=True),
-    "width": Number(2, MOST_TEXELS, whole=True),
-    "enough": POSITIVE,
-    "texel_cost": NOT_NEGATIVE,
-    "max_voxels": Number(0, MOST_VOXELS, whole=True),
-    "window_length": NOT_NEGATIVE,
-    "drive_pull_back": NOT_NEGATIVE,
-    "cube_voxels": Number(0, MOST_VOXELS, whole=True),
+    **dict.fromkeys(("planes", "max_planes"), Number(2, MOST_PLANES, whole=True)),
+    **dict.fromkeys(("height", "width"), Number(2, MOST_TEXELS, whole=True)),
+    **dict.fromkeys(("max_voxels", "cube_voxels"), Number(0, MOST_VOXELS, whole=True)),
+    **dict.fromkeys(("plane_pixels", "texel_pixels", "enough"), POSITIVE),
+    **dict.fromkeys(("max_texels", "rays_per_texel", "texels_per_ray", "texel_cost"), NOT_NEGATIVE),
+    **dict.fromkeys(("min_gain", "window_length", "drive_pull_back"), NOT_NEGATIVE),
 }
 FACES = ("front", "left", "right", "below")
 
 
 def rays_times(method: str, processors: int) -> int:
-    """How many times its rays a method draws in a step, in as many times fewer steps; a power of two.
-
-    Args:
-        method: with defaults.
-        processors: multiprocessors of the GPU; 0 on a CPU.
-    """
+    """How many times its rays a method with defaults draws in a step, in as many times fewer steps; a power of two.
+    ``processors`` are the multiprocessors of the GPU, 0 on a CPU."""
     fit = RAYS_PER_PROCESSOR * processors // DEFAULTS[method].rays
     return min(1 << max(fit, 1).bit_length() - 1, MOST_RAYS_TIMES)
 
 
 def steps_for(method: str, pixels: float, times: int = 1) -> int:
-    """Training steps of a window, in hundreds: more for captures of many pixels, in proportion.
-
-    Args:
-        method: with defaults.
-        pixels: training pixels of the window.
-        times: how many times the method's rays a step draws (``rays_times``).
-    """
+    """Training steps of a window, in hundreds: more for many training pixels, in proportion; fewer if a step draws
+    several times the method's rays (``rays_times``)."""
     multiple = min(max(1.0, pixels / PIXELS), MOST_TIMES)
     return 100 * round(DEFAULTS[method].steps * multiple / 100) // times
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:
-    """Raises InputError naming the option whose value cannot be used.
-
-    Args:
-        config: the rule's settings.
-        prefix: of the options on the command line, "--placement." for example.
-    """
+    """Raises InputError naming the option, with its prefix on the command line, whose value cannot be used."""
     check_options(config, RANGES, prefix)
     if not config.faces or not set(config.faces) <= set(FACES):
         raise InputError(f"{prefix}faces must be some of {', '.join(FACES)}, not {shown(config.faces)}.")

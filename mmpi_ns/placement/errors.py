@@ -41,14 +41,8 @@ class PixelErrors:
 
 
 def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> PixelErrors:
-    """e_p and e_t of observed points in every head of a plan: its MPIs, then the cube if there is one.
-
-    Args:
-        plan: the MPIs and the cube.
-        observations: the cameras.
-        cameras: [Q] camera of each observation.
-        points: [Q, 3] world position of each observed point.
-    """
+    """e_p and e_t of observed points [Q, 3], each seen by a camera [Q], in every head of a plan: its MPIs, then the
+    cube if there is one."""
     pairs = [mpi_errors(m, observations, cameras, points) for m in plan.mpis]
     if plan.cube is not None:
         texel = cube_errors(plan.cube, observations, cameras, points)
@@ -69,13 +63,8 @@ def mpi_errors(
 def pixel_slopes(
     mpi: MPIPlan, observations: Observations, cameras: NDArray[np.int64], points: Array
 ) -> tuple[Array, Array, Array]:
-    """Pixels that an observed point moves per unit of its disparity, tangent u and tangent v in an MPI's frame.
-
-    Independent of the planes and texels of the MPI, which can be chosen by these slopes.
-
-    Returns:
-        Three arrays [Q]; inf if the MPI does not contain the point.
-    """
+    """Pixels [Q] that an observed point moves per unit of its disparity, tangent u and tangent v in an MPI's frame, inf
+    if the MPI does not contain it. Independent of its planes and texels, which can be chosen by these slopes."""
     axes, origin = np.asarray(mpi.axes), np.asarray(mpi.origin)
     local = (points - origin) @ axes.T
     ahead = (local[:, 2] >= mpi.near) & (local[:, 2] <= mpi.far)

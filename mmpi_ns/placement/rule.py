@@ -5,6 +5,8 @@ with the smallest expected error for it (``errors.py``), and the candidate that 
 its texels is added, until the next would add too little. Heads that have become superfluous are removed. Then each MPI
 gets the planes that its observations need, and is widened until the borders of every image, and a margin around them,
 lie in some MPI.
+
+Two arrangements are fixed instead: four MPIs by hand along a drive, a baseline, and the paper's room.
 """
 
 from __future__ import annotations
@@ -15,11 +17,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.candidates import Candidate, find_candidates
+from mmpi_ns.placement.candidates import Candidate, facing_axes, find_candidates, vector
 from mmpi_ns.placement.errors import WORST
-from mmpi_ns.placement.hand_made import drive_plan, room_plan
-from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points, pixels_per_pixel
+from mmpi_ns.placement.observations import Array, Observations, VisiblePoints, find_visible_points, pixels_per_pixel
 from mmpi_ns.scene.plan import MOST_DETAIL, CubePlan, MPIPlan, ScenePlan
 
 MIN_PLANES = 16
@@ -31,6 +31,8 @@ BEYOND = 0.05
 """Margin around an image that should have texels, as a fraction of its sides, because other views look there."""
 WIDEST, FARTHEST = 3.0, 0.5
 """Limits on widened tangents, absolute and relative: a border far from all MPIs would cost too much."""
+OVERLAPPING = 1.25
+"""Half the extent of each MPI of a room, a tangent: above 1 neighbours overlap."""
 
 
 @dataclass
@@ -79,25 +81,12 @@ class PlacementConfig:
 
 
 def place(observations: Observations, config: PlacementConfig, training_rays: int | None = None) -> ScenePlan:
-    """The scene plan for some training cameras and what they saw.
-
-    Args:
-        observations: training cameras and points.
-        config: the rule's settings.
-        training_rays: pixel rays of the whole training, if known: texels are no finer than these can train.
-
-    Raises:
-        ValueError: the cameras leave nothing to place, e.g. all observations are behind their cameras.
-    """
+    """The scene plan for some training cameras and what they saw. Texels are no finer than the pixel rays of the whole
+    training can train, if known. Raises ValueError if all observations are behind their cameras."""
     visible = find_visible_points(observations)
-    size = (config.planes, config.height, config.width)
-    if config.arrangement == "drive":
-        # The hand-made rule is in metres; it was made where the nearest point lies 5 m away.
-        return drive_plan(observations, visible.near / 5, size, config.faces, config.drive_pull_back)
-    if config.arrangement == "room":
-        half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + visible.near
-        near = max(0.5 * visible.near, 1e-6)
-        return room_plan(observations, size, config.cube_voxels, near, half_size)
+    if config.arrangement != "automatic":
+        arrange = _drive if config.arrangement == "drive" else _room
+        return arrange(observations, visible.near, config)
     trainable = trainable_texel(observations, visible, config, training_rays)
     budget = affordable_texels(config, training_rays)
     finest = max(config.texel_pixels, trainable)
@@ -115,6 +104,42 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
     mpis = tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))  # two may be placed at one camera
     return ScenePlan(mpis, cube, 0.2 * visible.near, visible.near, origin, detail)
+
+
+def _drive(observations: Observations, content_near: float, config: PlacementConfig) -> ScenePlan:
+    """Some of four MPIs along a straight drive in the cameras' mean direction, placed by hand in metres."""
+    metre = content_near / 5  # the rule was made where the nearest point lies 5 m away
+    base = observations.mean_axes
+    centers = observations.centers @ base.T
+    start = np.array([centers[:, 0].mean(), centers[:, 1].mean(), centers[:, 2].min()])
+    travel = float(np.ptp(centers[:, 2])) / metre
+    back = config.drive_pull_back * travel
+    # origin (right, down, forward) in metres from the first camera, near, tangents along the MPI's own x and y
+    rule = {
+        "front": ((0.0, 0.0, -back), back + 3, (-1.0, 1.0, -0.35, 0.35)),
+        "left": ((8.0, 0.0, travel / 2), 10.0, (-2.5, 9.0, -0.7, 0.4)),
+        "right": ((-8.0, 0.0, travel / 2), 10.0, (-9.0, 2.5, -0.7, 0.4)),
+        "below": ((0.0, -4.0, travel / 2), 4.8, (-6.0, 6.0, -18.0, 6.0)),
+    }
+    mpis, size = [], (config.planes, config.height, config.width)
+    for name in config.faces:
+        origin, near, extent = rule[name]
+        world = (start + np.array(origin) * metre) @ base
+        mpis.append(MPIPlan(name, vector(world), facing_axes(base, name), near * metre, extent, *size))
+    return ScenePlan(tuple(mpis), None, 1.0 * metre, 5.0 * metre, "hand-made drive")
+
+
+def _room(observations: Observations, content_near: float, config: PlacementConfig) -> ScenePlan:
+    """The paper's ScanNet arrangement: five MPIs around the cameras' centre and a cube (sec. IV)."""
+    half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + content_near
+    near, base = max(0.5 * content_near, 1e-6), observations.mean_axes
+    center = (observations.centers.min(0) + observations.centers.max(0)) / 2
+    extent = (-OVERLAPPING, OVERLAPPING, -OVERLAPPING, OVERLAPPING)
+    names, size = ("front", "back", "left", "right", "below"), (config.planes, config.height, config.width)
+    mpis = (MPIPlan(n, vector(center), facing_axes(base, n), near, extent, *size) for n in names)
+    corners, voxels = (vector(center - half_size), vector(center + half_size)), config.cube_voxels
+    cube = CubePlan(*corners, (voxels, voxels, voxels)) if voxels else None
+    return ScenePlan(tuple(mpis), cube, 0.1 * near, near, "hand-made room")
 
 
 def trainable_texel(
@@ -139,19 +164,19 @@ def _choose(
     """The heads for a scene, with texels no finer than the budget allows, and the pixels that a texel spans."""
     candidates = find_candidates(observations, visible, with_cubes=config.max_voxels > 0)
 
-    def heads_at(chosen: _Chosen, size: float) -> tuple[list[MPIPlan | CubePlan], float]:
+    def heads_at(choice: _Choice, size: float) -> tuple[list[MPIPlan | CubePlan], float]:
         """Heads, and the share of the budget that they use."""
-        heads = chosen.heads(config, size)
+        heads = choice.heads(size)
         mpis = widened([h for h in heads if isinstance(h, MPIPlan)], observations, visible)
         heads = [*mpis, *(h for h in heads if isinstance(h, CubePlan))]
         return heads, sum(h.texels for h in heads) / config.max_texels if config.max_texels else 0.0
 
-    tried: list[tuple[_Chosen, float, list[MPIPlan | CubePlan], float]] = []
+    tried: list[tuple[_Choice, float, list[MPIPlan | CubePlan], float]] = []
     too_fine, texel_pixels = None, finest
     for _ in range(BUDGET_ROUNDS):
-        chosen = _Choice(candidates, visible.weights, config, texel_pixels).run()
-        heads, used = heads_at(chosen, texel_pixels)
-        tried.append((chosen, texel_pixels, heads, used))
+        choice = _Choice(candidates, visible.weights, config, texel_pixels)
+        heads, used = heads_at(choice, texel_pixels)
+        tried.append((choice, texel_pixels, heads, used))
         if used > 1.0:
             too_fine = texel_pixels
             # Coarser texels mean fewer rows, columns and planes: nearly a third power.
@@ -161,39 +186,18 @@ def _choose(
         else:
             texel_pixels = (too_fine * texel_pixels) ** 0.5
     # The last that fits; if none does, the last.
-    chosen, texel_pixels, heads, used = ([t for t in tried if t[-1] <= 1.0] or tried)[-1]
+    choice, texel_pixels, heads, used = ([t for t in tried if t[-1] <= 1.0] or tried)[-1]
     # Texels a little finer may have asked for further heads, which do not fit: then there is room for those alone.
     while used < FULL and texel_pixels / FINER >= finest:
-        finer, used = heads_at(chosen, texel_pixels / FINER)
+        finer, used = heads_at(choice, texel_pixels / FINER)
         if used > 1.0:
             break
         heads, texel_pixels = finer, texel_pixels / FINER
     return heads, texel_pixels
 
 
-@dataclass(frozen=True)
-class _Chosen:
-    """Candidates that serve a scene."""
-
-    candidates: list[Candidate]
-    owner: NDArray[np.int64]
-    """Which of them serves each observation."""
-
-    def heads(self, config: PlacementConfig, texel_pixels: float) -> list[MPIPlan | CubePlan]:
-        """Their heads with texels of a size, each MPI with the planes it needs."""
-        heads = []
-        for n, candidate in enumerate(self.candidates):
-            # Planes at which the error of four fifths of the observations that it serves is small enough.
-            error = candidate.plane[self.owner == n]
-            error = error[np.isfinite(error)]
-            steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * texel_pixels) if len(error) else 0.0
-            planes = int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, config.max_planes))
-            heads.append(candidate.at(texel_pixels, planes, config.max_voxels))
-        return heads
-
-
 class _Choice:
-    """Greedy choice among candidates, by the cost of every observation in each."""
+    """Greedy choice among candidates, by the cost of every observation in each; ``chosen`` are their numbers."""
 
     def __init__(
         self, candidates: list[Candidate], weights: NDArray[np.float64], config: PlacementConfig, texel_pixels: float
@@ -212,8 +216,21 @@ class _Choice:
         self.texels = np.array(texels, dtype=np.float64)
         self.price = self.texels**config.texel_cost
         self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
+        self.chosen = self._choose()
 
-    def run(self) -> _Chosen:
+    def heads(self, texel_pixels: float) -> list[MPIPlan | CubePlan]:
+        """The chosen heads with texels of a size, each MPI with the planes it needs."""
+        config, owner, heads = self.config, self.cost[self.chosen].argmin(0), []
+        for n, candidate in enumerate(self.candidates[j] for j in self.chosen):
+            # Planes at which the error of four fifths of the observations that it serves is small enough.
+            error = candidate.plane[owner == n]
+            error = error[np.isfinite(error)]
+            steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * texel_pixels) if len(error) else 0.0
+            planes = int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, config.max_planes))
+            heads.append(candidate.at(texel_pixels, planes, config.max_voxels))
+        return heads
+
+    def _choose(self) -> list[int]:
         """Adds, one by one, the candidate with the largest gain for its texels, until none gains enough."""
         # A scene needs an MPI, however little it gains.
         gain = np.maximum(self.nothing - self.cost, 0) @ self.weights
@@ -234,8 +251,7 @@ class _Choice:
         affordable = (self.texels <= self.texels[chosen].sum()) & ~self.is_cube
         alone = [int(np.where(affordable, gain, -1.0).argmax())]
         spared = self.config.min_gain * (len(chosen) - 1)
-        chosen = alone if self._total(alone) <= self._total(chosen) + spared else chosen
-        return _Chosen([self.candidates[j] for j in chosen], self.cost[chosen].argmin(0))
+        return alone if self._total(alone) <= self._total(chosen) + spared else chosen
 
     def _total(self, chosen: list[int]) -> float:
         """Remaining expected error, in bits, summed over images."""
@@ -260,11 +276,6 @@ def widened(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoi
 
     A border is tested at the depths between which the image's points lie. Each border point outside all MPIs is
     assigned to the MPI that must grow least for it.
-
-    Args:
-        mpis: the chosen MPIs.
-        observations: the training cameras.
-        visible: points that they see.
     """
     points = border_points(observations, visible)
     origins = np.array([m.origin for m in mpis], dtype=np.float64)

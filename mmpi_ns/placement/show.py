@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from mmpi_ns.placement.errors import WORST, PixelErrors, pixel_errors
-from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import VisiblePoints
+from mmpi_ns.placement.observations import Array, Observations, VisiblePoints
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import WindowedPlan
 

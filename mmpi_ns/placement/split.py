@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.observations import Array, Observations, farthest_first, find_visible_points
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import farthest_first, find_visible_points
 from mmpi_ns.scene.windows import Window, WindowedPlan
 
 MARGIN = 0.08
@@ -25,16 +24,8 @@ ROUNDS = 50
 def place_windows(
     observations: Observations, config: PlacementConfig, training_rays: int | None = None
 ) -> WindowedPlan:
-    """A plan for each window of a capture; a single one for a short capture.
-
-    Args:
-        observations: training cameras and what they saw.
-        config: the rule's settings; budgets are those of one window.
-        training_rays: pixel rays of one window's training, if known.
-
-    Raises:
-        ValueError: the cameras leave nothing to place.
-    """
+    """A plan for each window of a capture; a single one for a short capture. Budgets and ``training_rays`` are those of
+    one window. Raises ValueError if the cameras leave nothing to place."""
     balls = find_balls(observations, config.window_length)
     if len(balls) < 2:
         return WindowedPlan.single(place(observations, config, training_rays))
@@ -54,12 +45,8 @@ def most_pixels(observations: Observations, config: PlacementConfig) -> float:
 
 
 def find_balls(observations: Observations, length: float) -> list[tuple[Array, float, float]]:
-    """(centre, radius, margin) of the windows, in order along the way; independent of the cameras' order.
-
-    Args:
-        observations: the cameras.
-        length: maximum length of a window, in median distances of the content; 0 for no windows.
-    """
+    """(centre, radius, margin) of the windows, in order along the way; independent of the cameras' order. ``length`` is
+    the maximum of a window, in median distances of the content; 0 for no windows."""
     if length <= 0:
         return []
     visible = find_visible_points(observations)

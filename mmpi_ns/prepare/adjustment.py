@@ -1,5 +1,6 @@
-"""Bundle adjustment: points of all matches or of known poses, the lens as far as the images determine it, and how well
-they do."""
+"""What is done to a model: bundle adjustment, with points of all matches or of known poses and the lens as far as the
+images determine it; alignment with another track of the same cameras; and the frame of the scene, by gravity and
+metres."""
 
 from __future__ import annotations
 
@@ -9,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
-from mmpi_ns.capture.matching import MIN_ANGLE, quiet, triangulate_points
-from mmpi_ns.prepare.alignment import camera_poses, degrees_between, similarity_between
-from mmpi_ns.prepare.features import matched_keypoints
+from mmpi_ns.capture.sfm import MIN_ANGLE, quiet, triangulate_points, verified_matches
 from mmpi_ns.utils.errors import InputError, progress, say
 
+Array = NDArray[np.float64]
 STILL = 1e-6
 """Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive
 that took four times as long, and moved the focal length by 0.002 px."""
@@ -28,14 +29,21 @@ PARTS = 20
 """Number of images from which the two halves of a capture are also used separately to judge the focal length."""
 WIDE = 0.08
 """Width of the interval of the focal length, relative to it, from which --focal is asked for."""
-REFINE_ROUNDS = 3
-"""Rounds of refining known poses and triangulating points again."""
-COARSE_PX, FINE_PX = 8.0, 4.0
-"""Largest reprojection error of a point of known poses: while these are to be refined, and in the end."""
+REFINE_ROUNDS, COARSE_PX, FINE_PX = 3, 8.0, 4.0
+"""Rounds of refining known poses and triangulating points again; largest reprojection error of a point while these are
+to be refined, and in the end."""
 LEAST_SHARE = 0.2
 """Fraction of the matched keypoints that must become points; few do where known poses are those of other images."""
 BENT_PX = 0.8
 """Mean reprojection error above which another attempt is made even though the images are registered."""
+ROTATION_WEIGHT = 1.0
+"""Weight of rotations in the alignment of two tracks; the main direction of the centres has weight 1."""
+LEVEL_TURN = 0.15
+"""Minimum spread of the cameras' right vectors across their main direction for estimating gravity."""
+LEAST_GROUND, GROUND_SHARE, TRIALS = 50, 0.15, 2000
+"""Minimum number of points below the cameras for fitting the ground, the fraction that must lie on it, planes tried."""
+GROUND_TILT = 25.0
+"""Maximum angle in degrees between gravity estimated from the cameras and the normal of the ground."""
 
 
 @dataclass(frozen=True)
@@ -53,15 +61,8 @@ class Free:
 def adjust(
     model: pycolmap.Reconstruction, threads: int, lens: bool, principal_point: bool = False, poses: bool = True
 ) -> None:
-    """Bundle adjustment over all images with a robust loss, in place.
-
-    Args:
-        model: adjusted; its points always are.
-        threads: CPU threads; below 1 for all.
-        lens: refine focal length and distortion.
-        principal_point: refine the principal point.
-        poses: refine poses.
-    """
+    """Bundle adjustment of points, and of what is named, over all images with a robust loss, in place; ``lens`` is
+    focal length and distortion."""
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
     options.refine_rig_from_world = poses
     options.refine_focal_length = options.refine_extra_params = lens
@@ -83,11 +84,6 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
     """The model adjusted with more parameters free, if that lowers the error.
 
     Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point.
-
-    Args:
-        model: adjusted; not changed.
-        free: what may be refined.
-        threads: CPU threads; below 1 for all.
     """
     trials = []  # in words, and whether it is the four lens terms; else the principal point
     if free.principal_point:
@@ -97,44 +93,34 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
     if not trials:
         return model
     center = four_terms = False
+
+    def adjusted(start: pycolmap.Reconstruction, four_terms: bool, center: bool) -> pycolmap.Reconstruction:
+        """A copy adjusted with cameras of one radial term as OpenCV's, if asked, and the principal point free."""
+        trial = copy.deepcopy(start)
+        for camera in trial.cameras.values() if four_terms else ():
+            if camera.model.name == "SIMPLE_RADIAL":
+                f, cx, cy, k = camera.params
+                camera.model = pycolmap.CameraModelId.OPENCV
+                camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+        adjust(trial, threads, free.lens, center)
+        return trial
+
     with progress("Fitting the lens", 1 + len(trials)) as advance:
         light = with_fewer_points(model)
         adjust(light, threads, free.lens)
         advance()
         for says, is_lens in trials:
-            trial = copy.deepcopy(light)
-            if is_lens:
-                _give_four_terms(trial)
-            adjust(trial, threads, free.lens, center or not is_lens)
+            trial = adjusted(light, is_lens, center or not is_lens)
             advance()
-            before, after = rms_error(light), rms_error(trial)
+            # Root mean squares of the points' errors, each counted once for each image that sees it.
+            points = [[(p.error, p.track.length()) for p in m.points3D.values()] for m in (light, trial)]
+            columns = (np.array(rows, np.float64).reshape(-1, 2).T for rows in points)
+            before, after = (float(np.sqrt((e**2 * n).sum() / max(n.sum(), 1))) for e, n in columns)
             is_better = after < WORTH * before
             say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {'kept' if is_better else 'not kept'}.")
             if is_better:
                 light, center, four_terms = trial, center or not is_lens, four_terms or is_lens
-    if not center and not four_terms:
-        return model
-    best = copy.deepcopy(model)
-    if four_terms:
-        _give_four_terms(best)
-    adjust(best, threads, free.lens, center)
-    return best
-
-
-def _give_four_terms(model: pycolmap.Reconstruction) -> None:
-    """Cameras of one radial term become OpenCV's, with the others at zero."""
-    for camera in model.cameras.values():
-        if camera.model.name == "SIMPLE_RADIAL":
-            f, cx, cy, k = camera.params
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
-
-
-def rms_error(model: pycolmap.Reconstruction) -> float:
-    """Root mean square of the points' reprojection errors, each counted once for each image that sees it; pixels."""
-    errors = np.array([p.error for p in model.points3D.values()])
-    lengths = np.array([p.track.length() for p in model.points3D.values()])
-    return float(np.sqrt((errors**2 * lengths).sum() / max(int(lengths.sum()), 1)))
+    return adjusted(model, four_terms, center) if center or four_terms else model
 
 
 def quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
@@ -183,16 +169,12 @@ def with_all_points(
     return model
 
 
-def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float, float]:
-    """Focal lengths, in pixels, that bundle adjustments of one model end at under different assumptions.
+def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float, str]:
+    """Width, relative to the largest, of the interval of focal lengths that bundle adjustments of one model end at
+    under different assumptions, and the interval in words.
 
     Principal point in the middle; principal point free; each half of the images alone. The statistical error of one
-    adjustment is far smaller and means little, because the assumptions dominate. Of several cameras, the first.
-
-    Args:
-        model: not changed.
-        threads: CPU threads; below 1 for all.
-    """
+    adjustment is far smaller and means little, because the assumptions dominate. Of several cameras, the first."""
     light, ids = with_fewer_points(model), sorted(model.reg_image_ids())
     middle = len(ids) // 2
     trials: list[tuple[list[int], bool]] = [(ids, True)]
@@ -205,38 +187,26 @@ def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float,
         adjust(models[-1], threads, True, principal_point)
     firsts = [m.cameras[m.images[min(m.reg_image_ids())].camera_id] for m in models]
     focals = [float(camera.mean_focal_length()) for camera in firsts]
-    return min(focals), max(focals)
-
-
-def focal_in_words(low: float, high: float) -> str:
-    """The interval of a focal length, for the report."""
-    return f"between {low:.1f} and {high:.1f} px, {(high - low) / high:.1%} wide"
+    low, high = min(focals), max(focals)
+    return (high - low) / high, f"between {low:.1f} and {high:.1f} px, {(high - low) / high:.1%} wide"
 
 
 def map_known_poses(
     model: pycolmap.Reconstruction, database: Path, images: Path, refine_poses: bool, refine_lens: bool, threads: int
 ) -> tuple[pycolmap.Reconstruction, str]:
-    """Triangulates points from the poses of a model, and refines these.
+    """Triangulates points from the poses of a model, and refines these, aligned with the given scale and frame.
 
-    Args:
-        model: cameras and posed images without points; changed in place.
-        database: features and matches.
-        images: folder of the images.
-        refine_poses: bundle-adjust poses; the result is aligned with the given scale and frame.
-        refine_lens: bundle-adjust intrinsics as well.
-        threads: CPU threads; below 1 for all.
-
-    Returns:
-        The model with points, and what was done in words.
-
-    Raises:
-        InputError: the poses do not fit the matches.
+    Returns the model with points, and what was done in words. Raises InputError if the poses do not fit the matches.
     """
     _, before = camera_poses(model)
     refines = refine_poses or refine_lens
     with quiet():
         model = triangulate_points(model, database, images, threads, COARSE_PX if refines else FINE_PX)
-    share = model.compute_num_observations() / max(matched_keypoints(database, list(model.reg_image_ids())), 1)
+    matched: dict[int, set[int]] = {i: set() for i in model.reg_image_ids()}  # keypoints with a match in another image
+    for *pair, matches in verified_matches(database):
+        for i, keypoints in zip(pair, matches.T, strict=True) if all(i in matched for i in pair) else ():
+            matched[i].update(keypoints.tolist())
+    share = model.compute_num_observations() / max(sum(map(len, matched.values())), 1)
     if share < LEAST_SHARE:
         raise InputError(
             f"Only {share:.0%} of the matched keypoints become points from the given poses: the camera axes "
@@ -260,3 +230,115 @@ def map_known_poses(
         )
     say(says)
     return model, says
+
+
+def camera_poses(model: pycolmap.Reconstruction) -> tuple[list[str], Array]:
+    """Names in order of the image ids, and camera to world with OpenCV axes. [N, 4, 4]"""
+    images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    poses = np.tile(np.eye(4), (len(images), 1, 1))
+    for pose, image in zip(poses, images, strict=True):
+        pose[:3] = image.cam_from_world().inverse().matrix()
+    return [image.name for image in images], poses
+
+
+def degrees_between(first: Array, second: Array) -> Array:
+    """Angles [N] between rotations [N, 3, 3]."""
+    traces = np.einsum("nij,nij->n", first, second)
+    return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+
+
+def rotation_between(source: Array, target: Array) -> Array:
+    """The rotation [3, 3] that takes rotations [N, 3, 3] nearest to others: it turns all cameras of a track alike."""
+    return nearest_rotation(np.einsum("nij,nkj->ik", target, source))
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotation with the largest product with a matrix. [3, 3]"""
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray((u * [1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
+
+
+def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
+    """The similarity that aligns camera poses, camera to world [N, 4, 4], with other poses of the same cameras.
+
+    Uses centres and rotations: the centres of a straight track do not fix its roll, and noise tilts a short one.
+    (``pycolmap.estimate_sim3d`` uses centres alone, and gives up where they lie on a line or a plane, as drives do.)
+    """
+    a = source[:, :3, 3] - source[:, :3, 3].mean(0)
+    b = target[:, :3, 3] - target[:, :3, 3].mean(0)
+    by_centers = b.T @ a / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-24)
+    by_rotations = np.einsum("nij,nkj->ik", target[:, :3, :3], source[:, :3, :3]) / len(source)
+    rotation = nearest_rotation(by_centers + ROTATION_WEIGHT * by_rotations)
+    scale = float((a @ rotation.T * b).sum() / max((a * a).sum(), 1e-24))
+    translation = target[:, :3, 3].mean(0) - scale * rotation @ source[:, :3, 3].mean(0)
+    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)
+
+
+def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
+    """The plane that the cameras [N, 3] stand over: the most populous of SfM points [P, 3] among roughly level ones.
+
+    Returns its unit normal towards the cameras [3], and their median height above it. Raises InputError if too few
+    points lie below the cameras, or no plane is among them.
+    """
+    # Points below the nearest camera and near the track.
+    some = centers[:: max(1, len(centers) // 32)]
+    reach = 2 * np.linalg.norm(centers - np.median(centers, axis=0), axis=-1).max()
+    offset = points - some[np.linalg.norm(points[:, None] - some[None], axis=-1).argmin(1)]
+    height = offset @ up
+    across = np.linalg.norm(offset - height[:, None] * up, axis=-1)
+    below = points[(height < 0) & (-height > 0.05 * across) & (across < reach)]
+    if len(below) < LEAST_GROUND:
+        raise InputError(
+            f"--camera-height: only {len(below)} points lie below the cameras: too few to find the ground."
+        )
+    tolerance = 0.04 * abs(float(np.median(-((below - np.median(centers, axis=0)) @ up))))
+    rng, inside = np.random.default_rng(0), np.zeros(len(below), dtype=bool)
+    for _ in range(TRIALS):
+        a, b, c = below[rng.choice(len(below), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-12 or abs(normal @ up) / length < np.cos(np.radians(GROUND_TILT)):
+            continue
+        near = np.abs((below - a) @ normal) < tolerance * length
+        inside = near if near.sum() > inside.sum() else inside
+    if inside.sum() < GROUND_SHARE * len(below):
+        raise InputError("--camera-height: the points below the cameras lie on no common plane.")
+    center = below[inside].mean(0)
+    normal = np.linalg.eigh((below[inside] - center).T @ (below[inside] - center))[1][:, 0]
+    normal *= np.sign(normal @ up)
+    return normal, float(np.median((centers - center) @ normal))
+
+
+def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> tuple[pycolmap.Sim3d, str, str]:
+    """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
+
+    Without a ground, cameras are assumed level: up is perpendicular to all right vectors if they turn, else the mean up
+    vector. Without ``camera_height``, in metres above the ground, one unit is the extent of the track.
+
+    Returns the transform from the model to the scene, and the sources of up and of the unit in words.
+    """
+    _, poses = camera_poses(model)
+    centers = poses[:, :3, 3]
+    up, words = -poses[:, :3, 1].mean(0), "mean of the cameras, assumed level"
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    values, vectors = np.linalg.eigh(poses[:, :3, 0].T @ poses[:, :3, 0] / len(poses))
+    level = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
+    if values[1] > LEVEL_TURN and values[0] < 0.1 * values[1] and level @ up > 0.5:
+        up = level
+    if camera_height is not None:
+        points = np.array([p.xyz for p in model.points3D.values()])
+        up, height = fit_ground(points, centers, up)
+        if height <= 0:
+            raise InputError("--camera-height: the ground found lies above the cameras.")
+        scale, words = camera_height / height, "normal of the ground"
+        unit = f"1 metre, from a camera height of {camera_height:g} m above the ground"
+    else:
+        extent = float(np.ptp(centers @ np.linalg.svd(centers - centers.mean(0))[2][0]))
+        scale, unit = 1 / max(extent, 1e-12), "the extent of the camera track (metres are not known)"
+    heading = poses[0, :3, 2] - (poses[0, :3, 2] @ up) * up
+    if np.linalg.norm(heading) < 1e-6:  # the first camera looks up or down
+        heading = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    heading = heading / np.linalg.norm(heading)
+    rotation = np.stack([np.cross(heading, up), heading, up])
+    similarity = pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), -scale * rotation @ centers.mean(0))
+    return similarity, words, unit

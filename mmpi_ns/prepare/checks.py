@@ -8,35 +8,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from mmpi_ns.capture.exif import light_of
-from mmpi_ns.prepare.adjustment import WIDE, adjust, focal_in_words, is_bent, with_fewer_points
-from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between
+from mmpi_ns.prepare.adjustment import WIDE, Array, adjust, camera_poses, degrees_between, is_bent, with_fewer_points
 from mmpi_ns.prepare.evidence import local_median
 from mmpi_ns.prepare.images import in_short
 from mmpi_ns.utils.files import write_text
 
-SIDE = 640
-"""Longer side, in pixels, at which sharpness is measured."""
 BLURRED = 0.4
 """Fraction of its neighbours' sharpness below which an image counts as blurred."""
-JUMP = 5.0
-"""Times its neighbours' step (or turn) from which a step counts as a jump."""
-TURN = 8.0
-"""Minimum angle of such a turn, degrees."""
-FOCAL_OFF = (0.03, 0.05)
-"""Relative change of a given focal length, when refined, from which it is doubted, and the scene with it..."""
-FOCAL_HELPS = (0.95, 0.85)
-"""... if refining it lowers the reprojection error below these fractions."""
-WORST = 5
-"""Number of images with the least coverage that are listed."""
-CELLS = (8, 6)
-"""Columns and rows of the grid for coverage."""
+JUMP, TURN = 5.0, 8.0
+"""Times its neighbours' step (or turn) from which a step counts as a jump; minimum angle of such a turn, degrees."""
+FOCAL_OFF, FOCAL_HELPS = (0.03, 0.05), (0.95, 0.85)
+"""Relative change of a given focal length, when refined, from which it is doubted, and the scene with it, if refining
+it lowers the reprojection error below these fractions."""
+WORST, CELLS = 5, (8, 6)
+"""Number of images with the least coverage that are listed; columns and rows of the grid for coverage."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +57,6 @@ def by_kind(findings: Sequence[Finding]) -> list[str]:
     return lines
 
 
-def sharpness(gray: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian over that of the image, at a fixed size: independent of contrast, lowered by blur."""
-    scale = SIDE / max(gray.shape)
-    if scale < 1:
-        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    values = gray.astype(np.float32)
-    return float(cv2.Laplacian(values, cv2.CV_32F).var() / max(float(values.var()), 1.0))
-
-
 def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:
     """Images much less sharp than their neighbours (or than all others, if the images are not in order)."""
     usual = local_median(sharp, 7) if ordered else np.full(len(sharp), np.median(sharp))
@@ -89,13 +70,8 @@ def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:
 
 
 def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list[Finding]:
-    """Frames of a sequence where the track jumps or the camera turns abruptly.
-
-    Args:
-        names: images in order.
-        places: their indices in the input, so that a gap of two frames may be twice as long.
-        poses: camera to world, OpenCV axes. [N, 4, 4]
-    """
+    """Frames of a sequence where the track of poses [N, 4, 4] jumps or the camera turns abruptly; ``places`` are their
+    indices in the input, so that a gap of two frames may be twice as long."""
     if len(names) < 5:
         return []
     gaps = np.diff(places)
@@ -115,19 +91,13 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
 
 
 def doubtful_intrinsics(
-    model: pycolmap.Reconstruction, is_fixed: bool, focal: tuple[float, float] | None, threads: int
+    model: pycolmap.Reconstruction, is_fixed: bool, focal: tuple[float, str] | None, threads: int
 ) -> list[Finding]:
-    """Models, focal lengths and lenses that do not fit.
-
-    Args:
-        model: the final model.
-        is_fixed: intrinsics were given and kept; they are refined in a copy and compared.
-        focal: the interval of the focal length in pixels, where it was refined.
-        threads: CPU threads; below 1 for all.
-    """
+    """Models, focal lengths (``focal``: the interval in pixels of one that was refined) and lenses that do not fit.
+    Fixed intrinsics, which were given, are refined in a copy and compared."""
     findings = []
-    if focal is not None and focal[1] - focal[0] >= WIDE * focal[1]:
-        says = f"the images hardly determine the focal length ({focal_in_words(*focal)})"
+    if focal is not None and focal[0] >= WIDE:
+        says = f"the images hardly determine the focal length ({focal[1]})"
         findings.append(Finding("intrinsics?", "", f"{says}: give --focal if you know it"))
     if is_bent(model):
         error = model.compute_mean_reprojection_error()
@@ -171,17 +141,8 @@ def write_report(
     note: str,
     scene: Path,
 ) -> None:
-    """Writes report.md and report/track.png.
-
-    Args:
-        model: in the frame of the scene.
-        title: of the report.
-        rows: what the table says beyond the model's figures, by their names.
-        findings: of the checks; listed as warnings and marked in the drawing.
-        warnings: further ones, listed first.
-        note: the last line.
-        scene: folder to write to.
-    """
+    """Writes report.md and report/track.png of a scene: a table of ``rows`` and the model's figures, warnings with the
+    findings of the checks, which the drawing marks, and a last note."""
     covered = {}  # share of each image's cells that hold a keypoint with a point
     for i in model.reg_image_ids():
         image, camera = model.images[i], model.cameras[model.images[i].camera_id]

@@ -20,28 +20,26 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.matching import MIN_INLIERS, epipolar_distances, verified_matches
-from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between, rotation_between, similarity_between
+from mmpi_ns.capture.sfm import MIN_INLIERS, epipolar_distances, verified_matches
+from mmpi_ns.prepare.adjustment import Array, camera_poses, degrees_between, rotation_between, similarity_between
 
 Places = NDArray[np.int64]
 
-FIT_PX = 2.0
-"""Sampson distance, in pixels of an image side of 1,000, up to which a match lies on its epipolar line."""
-BESIDE = 4.0
-"""Multiple of that distance up to which a match lies beside its line."""
-
+FIT_PX, BESIDE = 2.0, 4.0
+"""Sampson distance, in pixels of an image side of 1,000, up to which a match lies on its epipolar line, and the
+multiple of it up to which it lies beside it."""
 REACH = 12
 """Maximum frame distance of pairs used for a gap; pairs farther apart have few matches, most of them wrong."""
-FEW = 60
-"""Minimum number of matches across a gap for a statement about it."""
-FEW_OF_ONE = 40
-"""Minimum number of an image's matches with earlier or with later ones for a statement about it."""
-LEAST_ANGLE = 1.0
-"""Minimum angle in degrees between the first and last ray on one side of a gap for triangulation from that side."""
-LEAST_POINTS = 20
-"""Minimum number of such points for the scale of a gap."""
+FEW, FEW_OF_ONE = 60, 40
+"""Minimum number of matches for a statement about a gap, and of an image's with earlier or later ones about it."""
+LEAST_ANGLE, LEAST_POINTS = 1.0, 20
+"""Minimum angle in degrees between the first and last ray on one side of a gap for triangulation from that side, and
+minimum number of such points for the scale of a gap."""
 WINDOW = 5
 """Steps before and after a gap that are compared with each other."""
+APART, TURNED = (0.01, 0.03), (1.0, 2.0)
+"""Mean and largest distance between the centres of two mappers, as shares of the track, up to which they found the same
+one, and the same of their rotations, in degrees."""
 
 
 @dataclass(frozen=True)
@@ -95,18 +93,13 @@ class Agreement:
     """Distances of the centres, relative to the extent of the track. [N]"""
     turns: Array
     """Degrees between the rotations. [N]"""
+    is_same: bool
+    """Whether both are the same track."""
 
 
 def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
-    """The evidence on a mapper's model.
-
-    Args:
-        name: of the mapper.
-        says: how it made the model, in words.
-        model: poses and points, with the keypoints of the database.
-        database: verified matches.
-        offered: names of all images of the capture, in order.
-    """
+    """The evidence on a mapper's model, which has the keypoints of the database; ``offered`` are the names of all
+    images of the capture in order."""
     names, poses = camera_poses(model)
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
     points = {  # the point that each keypoint sees, -1 for none
@@ -164,16 +157,12 @@ def share(part: Array, whole: Array) -> float:
 
 
 def bridges(pairs: Pairs, count: int, part: Array, whole: Array | None = None) -> Array:
-    """Fraction of the matches across each gap between two registered images that hold.
+    """Fraction of the matches across each gap between two of N registered images that hold, NaN for few. [N - 1]
 
     Args:
-        pairs: of the model.
-        count: registered images, N.
+        pairs, count: of the model; N.
         part: ``pairs.tracked`` or ``pairs.fitting``. [P]
         whole: what it is a part of; all matches unless given. [P]
-
-    Returns:
-        Fractions; NaN if there are too few matches across. [N - 1]
     """
     near = pairs.second - pairs.first <= REACH
     first, second = pairs.first[near], pairs.second[near]
@@ -205,10 +194,8 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
     epipolar lines show little.
 
     Args:
-        points: number of the point that each observation sees. [O]
-        frames: place of its image. [O]
-        centers: of its camera. [O, 3]
-        rays: unit, world axes. [O, 3]
+        points, frames: number of the point that each observation sees, and place of its image. [O]
+        centers, rays: of its camera, and unit, world axes. [O, 3]
         count: registered images, N.
 
     Returns:
@@ -252,12 +239,8 @@ def local_median(values: Array, reach: int) -> Array:
 
 
 def strides(witness: Witness) -> tuple[Array, Array]:
-    """How even the steps from frame to frame are; a step over missing frames is divided among them.
-
-    Returns:
-        Length of each step relative to the median of the steps around it [N - 1]; ratio, at least 1, of the median
-        steps after and before each frame, 1 near the ends, where there are few [N].
-    """
+    """Length of each step, divided among missing frames, relative to the median of the steps around it [N - 1]; ratio,
+    at least 1, of the median steps after and before each frame, 1 near the ends, where there are few [N]."""
     lengths = np.linalg.norm(np.diff(witness.poses[:, :3, 3], axis=0), axis=-1) / np.maximum(np.diff(witness.places), 1)
     usual = float(np.median(lengths)) if len(lengths) else 0.0
     jumps = lengths / np.maximum(local_median(lengths, WINDOW) + 0.05 * usual, 1e-12)
@@ -281,4 +264,7 @@ def agreement(first: Witness, second: Witness) -> Agreement | None:
     moved = a[:, :3, 3] @ similarity[:, :3].T + similarity[:, 3]
     extent = max(float(np.linalg.norm(np.ptp(b[:, :3, 3], axis=0))), 1e-12)
     turns = degrees_between(rotation_between(a[:, :3, :3], b[:, :3, :3]) @ a[:, :3, :3], b[:, :3, :3])
-    return Agreement(common, np.linalg.norm(moved - b[:, :3, 3], axis=-1) / extent, turns)
+    centers = np.linalg.norm(moved - b[:, :3, 3], axis=-1) / extent
+    limits = ((centers, APART), (turns, TURNED))
+    is_same = all(values.mean() <= mean and values.max() <= largest for values, (mean, largest) in limits)
+    return Agreement(common, centers, turns, is_same)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Sequence
@@ -15,18 +14,17 @@ import pycolmap
 from PIL import Image
 
 from mmpi_ns.capture.exif import kept_tags
-from mmpi_ns.capture.matching import quiet
-from mmpi_ns.prepare.alignment import camera_poses
-from mmpi_ns.prepare.images import Photo, read_intrinsics
+from mmpi_ns.capture.sfm import quiet
+from mmpi_ns.prepare.adjustment import camera_poses
+from mmpi_ns.prepare.images import QUALITY, Photo
+from mmpi_ns.prepare.poses import opencv_intrinsics
 from mmpi_ns.utils.errors import InputError, progress
-from mmpi_ns.utils.files import whole, write_text
+from mmpi_ns.utils.files import whole
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 """Written explicitly: without it, nerfstudio-data assumes an axis swap if colmap/sparse/0 exists."""
 PART = re.compile(r"(images|masks)(_\d+)?|colmap|sparse_pc\.ply|report\.md|report|transforms\.json")
 """The parts of a scene."""
-QUALITY = 97
-"""Of JPEG."""
 
 
 @dataclass(frozen=True)
@@ -72,16 +70,16 @@ def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Spli
 def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes: dict[str, Any]) -> dict[str, Any]:
     """transforms.json for the registered images; intrinsics that all share are at the top level. Raises InputError if
     nerfstudio-data reads no scene with these lenses."""
-    lenses = {number: read_intrinsics(camera) for number, camera in model.cameras.items()}
-    if len({lens.fisheye for lens in lenses.values()}) > 1:
+    lenses = {number: opencv_intrinsics(camera) for number, camera in model.cameras.items()}
+    kinds = {is_fisheye for _, is_fisheye in lenses.values()}
+    if len(kinds) > 1:
         raise InputError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
-    is_fisheye = any(lens.fisheye for lens in lenses.values())
-    keys = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2")
+    keys = ("k1", "k2", "k3", "k4") if True in kinds else ("k1", "k2", "p1", "p2")
     entries: dict[int, dict[str, Any]] = {}
-    for number, lens in lenses.items():
+    for number, (values, _) in lenses.items():
         size = {"w": model.cameras[number].width, "h": model.cameras[number].height}
-        entry = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, **size}
-        entries[number] = entry | dict(zip(keys, lens.distortion, strict=True))
+        entry = dict(zip(("fl_x", "fl_y", "cx", "cy"), values[:4], strict=True)) | size
+        entries[number] = entry | dict(zip(keys, values[4:], strict=True))
     is_shared = len(entries) == 1
     camera_of = {image.name: image.camera_id for image in model.images.values()}
     frames = []
@@ -93,7 +91,7 @@ def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes:
         frames.append({**frame, "transform_matrix": (pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()})
     test = [f"images/{n}" for n in split.test]
     return {
-        "camera_model": "OPENCV_FISHEYE" if is_fisheye else "OPENCV",
+        "camera_model": "OPENCV_FISHEYE" if True in kinds else "OPENCV",
         **(next(iter(entries.values())) if is_shared else {}),
         "frames": frames,
         "train_filenames": [f"images/{n}" for n in split.train],
@@ -139,20 +137,11 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
             small = Image.fromarray(blocks.min((1, 3)))
         else:
             small = image.reduce(factor)
+    kind = "PNG" if target.suffix.lower() == ".png" else "JPEG"
+    if kind == "JPEG" and small.mode != "L":
+        small = small.convert("RGB")
     with whole(target) as partial:
-        if target.suffix.lower() == ".png":
-            small.save(partial, format="PNG", exif=tags)
-        else:
-            small = small.convert("L" if small.mode == "L" else "RGB")
-            small.save(partial, format="JPEG", quality=QUALITY, subsampling=0, exif=tags)
-
-
-def write_scene(model: pycolmap.Reconstruction, scene: Path, content: dict[str, Any]) -> None:
-    """Writes the COLMAP model, the points, and last transforms.json."""
-    (scene / "colmap" / "sparse" / "0").mkdir(parents=True, exist_ok=True)
-    model.write(scene / "colmap" / "sparse" / "0")
-    model.export_PLY(scene / "sparse_pc.ply")
-    write_text(scene / "transforms.json", json.dumps(content, indent=1))
+        small.save(partial, format=kind, quality=QUALITY, subsampling=0, exif=tags)
 
 
 def publish(built: Path, scene: Path, replaced: Path) -> None:
@@ -180,18 +169,9 @@ def undistort(
     target: Path,
     threads: int,
 ) -> tuple[pycolmap.Reconstruction, list[Photo]]:
-    """Writes undistorted images, with their EXIF, and masks.
+    """Writes undistorted images, with their EXIF, and masks (``NAME.png``) to folders of these names in ``target``.
 
-    Args:
-        model: not changed.
-        photos: registered images.
-        images: folder of the images.
-        masks: folder of the masks (``NAME.png``), or None.
-        target: gets ``images`` and ``masks``.
-        threads: CPU threads; below 1 for all.
-
-    Returns:
-        The model with pinhole cameras and moved keypoints, and the images with their new sizes.
+    Returns the model with pinhole cameras and moved keypoints, and the registered photos with their new sizes.
     """
     (target / "bent").mkdir(parents=True)
     model.write(target / "bent")
@@ -204,6 +184,13 @@ def undistort(
     flat = pycolmap.Reconstruction(target / "sparse")
     flat.update_point_3d_errors()
     camera_of = {image.name: image.camera_id for image in model.images.values()}
+
+    def flattened(mask: Image.Image, camera: int) -> Image.Image:
+        bitmap = pycolmap.Bitmap.from_array(np.asarray(mask))
+        return Image.fromarray(
+            pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, model.cameras[camera])[0].to_array()
+        )
+
     flat_photos = []
     for photo in photos:
         number = camera_of[photo.name]
@@ -212,19 +199,13 @@ def undistort(
         if alpha is not None:  # COLMAP reads colours alone
             with Image.open(target / "images" / photo.name) as image:
                 tags = image.getexif()
-                image.putalpha(_undistort_mask(alpha, model.cameras[number]))
+                image.putalpha(flattened(alpha, number))
             image.save(target / "images" / photo.name, exif=tags)
         if masks is not None:
             (target / "masks").mkdir(exist_ok=True)
             with Image.open(masks / f"{photo.name}.png") as mask:
-                flat_mask = _undistort_mask(mask, model.cameras[number]).point(lambda v: 255 if v == 255 else 0)
+                flat_mask = flattened(mask, number).point(lambda v: 255 if v == 255 else 0)
             flat_mask.save(target / "masks" / f"{photo.name}.png")
         size = flat.cameras[number]
         flat_photos.append(replace(photo, width=size.width, height=size.height, exif_focal=None))
     return flat, flat_photos
-
-
-def _undistort_mask(mask: Image.Image, camera: pycolmap.Camera) -> Image.Image:
-    bitmap = pycolmap.Bitmap.from_array(np.asarray(mask))
-    flat, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, camera)
-    return Image.fromarray(flat.to_array())

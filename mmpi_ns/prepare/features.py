@@ -19,14 +19,13 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
-from mmpi_ns.capture.matching import (
+from mmpi_ns.capture.sfm import (
     MIN_INLIERS,
     count_features,
     find_features,
     match_pairs,
     new_model,
     quiet,
-    verified_matches,
     write_images,
 )
 from mmpi_ns.prepare.images import Photo
@@ -35,32 +34,27 @@ from mmpi_ns.utils.files import whole
 
 DATABASE = "database.db"
 """Name of a database in its folder."""
-BATCH = 8
-"""Images extracted at a time: the most that an interruption loses."""
-PAIR_BATCH = 64
+BATCH, PAIR_BATCH = 8, 64
+"""Images extracted, and pairs matched, at a time: the most that an interruption loses."""
 LARGEST_SIDE = 2000
 """Larger images are reduced to this side for SIFT (docs/prepare.md has time and error by size)."""
-PIXELS_A_FEATURE = 100
-"""At most one feature for this many pixels: more are redundant, and the cost of matching is quadratic."""
-LEAST_FEATURES = 2048
-"""Small images may have this many."""
-FAINT = 0.003
-"""SIFT's peak threshold for images with few features: weak ones count too."""
-SAMPLE = 4
-"""Images that are looked at to find whether they have few."""
+PIXELS_A_FEATURE, LEAST_FEATURES = 100, 2048
+"""At most one feature for this many pixels, but small images may have the second number: more are redundant, and the
+cost of matching is quadratic."""
+FAINT, SAMPLE = 0.003, 4
+"""SIFT's peak threshold for images with few features: weak ones count too; and images looked at to find whether they
+have few."""
 FEATURES = 50
 """An image with fewer is of no use."""
 Matching = Literal["auto", "sequential", "exhaustive", "retrieval"]
-FEW = 40
-"""Up to this many images are matched exhaustively, whatever their order."""
-MANY = 120
-"""More unordered images than this are matched with similar ones only."""
+FEW, MANY = 40, 120
+"""Up to the first number images are matched exhaustively, whatever their order; more unordered ones than the second
+with similar ones only."""
 WORDS, WORDS_FROM, SUMMED, ROUNDS = 64, 20_000, 800, 8
 """Vocabulary size, descriptors it is learnt from, descriptors of an image that are summed, and rounds of k-means."""
-REVISITS = 3
-"""Similar images that each image of a sequence is matched with besides its neighbours in time."""
-LOOK_ALIKES = 30
-"""Similar images that each image of a large unordered set is matched with."""
+REVISITS, LOOK_ALIKES = 3, 30
+"""Similar images that each image of a sequence, besides its neighbours, and of a large unordered set is matched
+with."""
 FAR_STEPS = (15, 20, 30, 45)
 """Frame distances beyond the overlap that are matched too, because slow stretches need a longer baseline."""
 
@@ -117,11 +111,8 @@ def extract(
 
 
 def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:
-    """Matches and verifies pairs of images (indices into ``photos``); pairs matched before are skipped.
-
-    Returns:
-        Pairs with verified matches.
-    """
+    """Matches and verifies pairs of images (indices into ``photos``), but for those matched before; returns the number
+    of pairs with verified matches."""
     with progress("Matching pairs", len(pairs)) as advance, quiet():
         for start in range(0, len(pairs), PAIR_BATCH):
             batch = pairs[start : start + PAIR_BATCH]
@@ -135,16 +126,6 @@ def matching_pairs(database: Path) -> list[tuple[int, int]]:
     with pycolmap.Database.open(database) as opened:
         pairs, inliers = opened.read_two_view_geometry_num_inliers()
     return [pycolmap.pair_id_to_image_pair(p) for p, n in zip(pairs, inliers, strict=True) if n >= MIN_INLIERS]
-
-
-def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:
-    """Keypoints of these images with a verified match in another of them."""
-    matched: dict[int, set[int]] = {i: set() for i in image_ids}
-    for *pair, matches in verified_matches(database):
-        if all(i in matched for i in pair):
-            for i, keypoints in zip(pair, matches.T, strict=True):
-                matched[i].update(keypoints.tolist())
-    return sum(map(len, matched.values()))
 
 
 def image_similarity(database: Path, count: int) -> NDArray[np.float32]:

@@ -1,21 +1,23 @@
-"""The images of a capture: finding them, upright copies, masks, EXIF, and the cameras that SfM starts from."""
+"""The images of a capture: found in a folder and copied upright, or the frames of a video that image motion and
+sharpness choose; their EXIF and masks."""
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
+import cv2
 import numpy as np
-import pycolmap
+from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from mmpi_ns.capture.exif import kept_tags, positive_number
 from mmpi_ns.utils.errors import InputError, progress, say
-from mmpi_ns.utils.files import whole
+from mmpi_ns.utils.files import whole, write_text
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 HEIF = (".heic", ".heif")
@@ -27,14 +29,16 @@ BODY_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
 FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 KEPT = {"JPEG": (".jpg", ".jpeg"), "PNG": (".png",)}
 """Formats that are copied unchanged; others become PNG."""
+QUALITY = 97
+"""Of JPEG."""
 FILM_WIDTH = 36.0
 """Millimetres: EXIF's 35-mm equivalent refers to film this wide."""
-Lens = Literal["auto", "pinhole", "radial", "opencv", "fisheye"]
-Sharing = Literal["auto", "shared", "per-image"]
-MODELS = {"pinhole": "PINHOLE", "radial": "SIMPLE_RADIAL", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
-GUESSED_FOCAL = 1.2
-"""Focal length over the longer side if nothing is known: COLMAP's guess."""
-GIVEN_COUNTS = {3: "f cx cy", 4: "fx fy cx cy", 8: "fx fy cx cy k1 k2 p1 p2"}
+SIDE, TRACK_WIDTH = 640, 320
+"""Longer side at which sharpness is measured, and width at which motion is; pixels."""
+LOST = 0.15
+"""Motion, relative to the width, assumed for frames that cannot be tracked from the last (a cut, a blank frame)."""
+MOST_MOTION = 0.15
+"""Motion between chosen frames beyond which SfM gets difficult."""
 
 
 @dataclass(frozen=True)
@@ -140,11 +144,8 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
                             upright = Image.fromarray(np.clip(values / top * 255, 0, 255).astype(np.uint8))
                         has_alpha = upright.mode in ("RGBA", "LA", "PA") and copy.suffix.lower() == ".png"
                         upright = upright.convert("L" if upright.mode in ("1", "L") else "RGBA" if has_alpha else "RGB")
-                        tags = kept_tags(image)
-                        if copy.suffix.lower() == ".png":
-                            upright.save(partial, format="PNG", exif=tags)
-                        else:
-                            upright.save(partial, format="JPEG", quality=97, subsampling=0, exif=tags)
+                        kind = "PNG" if copy.suffix.lower() == ".png" else "JPEG"
+                        upright.save(partial, format=kind, quality=QUALITY, subsampling=0, exif=kept_tags(image))
             shot = exif.get_ifd(ExifTags.IFD.Exif)
             parts = [exif.get(tag) for tag in BODY_TAGS] + [shot.get(tag) for tag in FOCAL_TAGS]
             lens = " ".join(str(part).strip() for part in parts if part)
@@ -168,11 +169,8 @@ def open_image(path: Path) -> Image.Image:
 def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     """Writes a mask for each image to ``target/NAME.png``: white is used, black (zero) is left out.
 
-    Returns:
-        Images that had a mask; the others get an all-white one, since nerfstudio wants all or none.
-
-    Raises:
-        InputError: no mask fits an image, or one has another size.
+    Returns the number of images that had a mask; the others get an all-white one, since nerfstudio wants all or none.
+    Raises InputError if no mask fits an image, or one has another size.
     """
     files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES]
     bare = [SUFFIXES.sub("", p.relative_to(folder).as_posix()) for p in files]
@@ -201,84 +199,115 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     return count
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """A lens in pixels of one image: OpenCV's pinhole and distortion, or OpenCV's fisheye."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2; k1 to k4 of a fisheye lens."""
-    fisheye: bool = False
+def sharpness(gray: NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian over that of the image, at a fixed size: independent of contrast, lowered by blur."""
+    scale = SIDE / max(gray.shape)
+    if scale < 1:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+    values = gray.astype(np.float32)
+    return float(cv2.Laplacian(values, cv2.CV_32F).var() / max(float(values.var()), 1.0))
 
 
-def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
-    """The camera of ``--camera``. Raises InputError if the numbers fit none or a focal length is not positive."""
-    if len(values) not in GIVEN_COUNTS:
-        raise InputError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
-    if len(values) == 3:
-        values = (values[0], *values)
-    if min(values[:2]) <= 0:
-        raise InputError("--camera: focal lengths must be positive, in pixels.")
-    lens = tuple(values[4:]) or (0.0,) * 4
-    return Intrinsics(*values[:4], distortion=lens, fisheye=fisheye)  # type: ignore[arg-type]
+def select_frames(video: Path, target: Path, max_frames: int, step: float) -> list[Photo]:
+    """Writes the chosen frames of a video to ``target/images``. Raises InputError if it cannot be read, or shows no
+    motion."""
+    (target / "images").mkdir(parents=True, exist_ok=True)
+    log = target / "measured.json"
+    if not log.exists():
+        write_text(log, json.dumps(measure(video)))
+    motion, sharp = np.array(json.loads(log.read_text(encoding="utf-8")))
+    chosen, used = choose_frames(motion, sharp, max_frames, step)
+    frames = len(motion)
+    if len(chosen) < 2:
+        raise InputError(f"{video} shows no motion in {frames} frames: there is no second view.")
+    say(f"{len(chosen)} of {frames} frames taken: the sharpest for every {used:.1%} of the width of motion.")
+    if used > MOST_MOTION:
+        remedy = f"raise --max-frames above {max_frames} or cut the video into shorter ones"
+        say(f"{used:.0%} of the width between frames is much: {remedy}.", "yellow")
+    capture, _ = _open(video)
+    photos = []
+    with progress("Writing frames", len(chosen)) as advance:
+        for index in range(chosen[-1] + 1):
+            if not capture.grab():
+                raise InputError(f"{video} could be read to frame {index - 1} this time: it changed, or is damaged.")
+            if index != chosen[len(photos)]:
+                continue
+            _, frame = capture.retrieve()
+            name = f"frame_{index:06d}.jpg"
+            path = target / "images" / name
+            if not path.exists():
+                is_encoded, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+                if not is_encoded:
+                    raise InputError(f"Frame {index} of {video} cannot be written.")
+                with whole(path) as partial:
+                    partial.write_bytes(data.tobytes())
+            photos.append(Photo(name, frame.shape[1], frame.shape[0], source=name))
+            advance(1)
+    capture.release()
+    return photos
 
 
-def make_cameras(
-    photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
-) -> tuple[list[int], list[pycolmap.Camera]]:
-    """Cameras from given intrinsics, else from EXIF, else guessed.
+def measure(video: Path) -> tuple[list[float], list[float]]:
+    """First pass, with two small frames in memory: motion of each since the one before over the width, and sharpness.
+    Raises InputError if the video cannot be read."""
+    capture, total = _open(video)
+    motion, sharp = [], []
+    last = None
+    with progress("Reading the video", total or None) as advance:
+        while True:
+            ok, frame = capture.read()
+            if not ok:
+                break
+            gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+            sharp.append(sharpness(gray))  # type: ignore[arg-type]
+            scale = TRACK_WIDTH / gray.shape[1]
+            small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            motion.append(0.0 if last is None else median_motion(last, small))  # type: ignore[arg-type]
+            last = small
+            advance(1)
+    capture.release()
+    if not motion:
+        raise InputError(f"{video} holds no frame that can be read: it is damaged, or its codec is unknown here.")
+    if total and len(motion) < 0.9 * total:
+        say(f"{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.", "yellow")
+    return motion, sharp
 
-    Args:
-        photos: the images.
-        sharing: which of them share a camera; auto: those of one size, lens and known intrinsics.
-        lenses: known intrinsics by image name.
-        focal: focal length in pixels, from the command line.
-        lens: distortion model if none is given.
 
-    Returns:
-        Camera of each image, numbered from 1, and the cameras in this order.
+def _open(video: Path) -> tuple[cv2.VideoCapture, int]:
+    capture = cv2.VideoCapture(str(video))
+    if not capture.isOpened():
+        raise InputError(f"{video} cannot be opened as a video: it is damaged, or its codec is unknown here.")
+    return capture, max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
 
-    Raises:
-        InputError: images of different sizes are to share one camera.
+
+def median_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
+    """Median optical flow of corners between two gray images, as a share of the width."""
+    corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 7)
+    if corners is None or len(corners) < 8:
+        return LOST
+    moved, is_tracked, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
+    back, is_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
+    good = (is_tracked & is_back).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=-1).ravel() < 1)
+    if good.sum() < 8:
+        return LOST
+    return float(np.median(np.linalg.norm(moved - corners, axis=-1).ravel()[good])) / before.shape[1]
+
+
+def choose_frames(
+    motion: NDArray[np.float64], sharp: NDArray[np.float64], max_frames: int, step: float
+) -> tuple[list[int], float]:
+    """The sharpest frame of every stretch of equal motion, by the motion of each frame since the one before, as a share
+    of the width [N], and its sharpness [N]; and the length of a stretch: ``step``, or more for ``max_frames`` at most.
+
+    A camera that stands still adds no frame. The first and last stretch count like the others.
     """
-    sizes = {(p.width, p.height) for p in photos}
-    if sharing == "shared" and len(sizes) > 1:
-        listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
-        raise InputError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
-    by_key: dict[Any, int] = {}
-    numbers: list[int] = []
-    cameras: list[pycolmap.Camera] = []
-    for photo in photos:
-        intrinsics = lenses.get(photo.name)
-        key = (photo.width, photo.height, "" if sharing == "shared" else photo.lens, intrinsics)
-        number = by_key.setdefault(photo.name if sharing == "per-image" else key, len(cameras) + 1)
-        numbers.append(number)
-        if number <= len(cameras):
-            continue
-        if intrinsics is not None:
-            params = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
-            is_bent = intrinsics.fisheye or any(intrinsics.distortion)
-            model = "OPENCV_FISHEYE" if intrinsics.fisheye else "OPENCV" if is_bent else "PINHOLE"
-            params += intrinsics.distortion if is_bent else ()
-            size = {"width": photo.width, "height": photo.height, "camera_id": number}
-            camera = pycolmap.Camera(model=model, params=params, **size)
-        else:
-            model = MODELS["radial" if lens == "auto" and focal is None else "pinhole" if lens == "auto" else lens]
-            guess = focal or photo.exif_focal or GUESSED_FOCAL * max(photo.width, photo.height)
-            camera = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
-        camera.has_prior_focal_length = bool(intrinsics or focal or photo.exif_focal)
-        cameras.append(camera)
-    return numbers, cameras
-
-
-def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
-    """A pycolmap camera as OpenCV's. Raises InputError if nerfstudio-data does not support the lens model."""
-    name, terms = camera.model.name, [float(v) for v in camera.params[camera.extra_params_idxs()]]
-    if name not in (*MODELS.values(), "SIMPLE_PINHOLE", "RADIAL"):
-        raise InputError(f"Lens model {name} is not supported in transforms.json.")
-    f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    k1, k2, k3, k4 = (*terms, 0.0, 0.0, 0.0, 0.0)[:4]
-    return Intrinsics(*f, distortion=(k1, k2, k3, k4), fisheye=name == "OPENCV_FISHEYE")
+    path = np.cumsum(motion)
+    used = max(step, float(path[-1]) / max(max_frames - 1, 1) * (1 + 1e-9))
+    stretch = np.floor(path / used + 0.5).astype(int)
+    chosen = []
+    for number in np.unique(stretch):
+        frames = np.nonzero(stretch == number)[0]
+        # near the middle of its stretch unless another is clearly sharper, to keep the spacing even
+        off = np.abs(path[frames] / used - number)
+        chosen.append(int(frames[np.argmax(sharp[frames] * (1 - 0.5 * off))]))
+    return chosen, used

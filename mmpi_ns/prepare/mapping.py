@@ -21,17 +21,16 @@ from pathlib import Path
 
 import pycolmap
 
-from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet
+from mmpi_ns.capture.sfm import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.adjustment import STILL, Free, is_bent, polish, quality, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.features import matching_pairs
-from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, agrees, best_first, judge_alone, judge_together
+from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, best_first, judge_alone, judge_together
 from mmpi_ns.utils.errors import InputError, progress, say
 
-ENOUGH = 0.95
-"""Fraction of registered images at which no further attempt is made."""
-CARRIES = 0.5
-"""Fraction of images from which a model is continued with looser settings instead of starting over."""
+ENOUGH, CARRIES = 0.95, 0.5
+"""Fraction of registered images at which no further attempt is made, and from which a model is continued with looser
+settings instead of starting over."""
 SNAPSHOT = 40
 """Images registered between two snapshots, from which an interrupted run resumes."""
 MANY = 100
@@ -112,13 +111,8 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
     An attempt continues the best model of the earlier ones if that is sound and contains the fraction ``CARRIES`` of
     the images: often it stopped at one stretch with few matches, and the rest need not be computed again.
 
-    Args:
-        task: what is to be mapped.
-        database: features, verified matches and the cameras to start from.
-        attempts: maximum number of attempts.
-
-    Raises:
-        InputError: no attempt found an initial pair.
+    Raises InputError if no attempt, of ``attempts`` at most, finds an initial pair in the database, whose cameras it
+    starts from.
     """
     total, pairs = len(task.offered), len(matching_pairs(database))
     if not pairs:
@@ -231,11 +225,10 @@ def map_globally(
     Every random draw is seeded, small angles are kept, and given intrinsics left alone.
 
     Args:
-        task: what is to be mapped.
+        task, threads: what is to be mapped, and CPU threads.
         name: of the start: its folder gets the models.
         focals: focal lengths to start from, in pixels by camera id; the others are those of the database.
         names: the images to place.
-        threads: CPU threads.
     """
     folder, folders, refine = task.work / name, task.work / name / "models", task.free.lens
     if not (folder / "done").exists():
@@ -268,11 +261,7 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
 
     The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse.
 
-    Returns:
-        Poses and points, the mappers in words, and how far they can be believed.
-
-    Raises:
-        InputError: neither mapper makes a model.
+    Returns it, the mappers in words, and how far it can be believed. Raises InputError if neither mapper makes a model.
     """
     chosen, *others = _candidates(task)
     with progress("Adding points", 1) as advance:
@@ -302,7 +291,7 @@ def _candidates(task: Task) -> list[Witness]:
             candidates += _globally(some, task.placed, task)
             right = [w for w in candidates if judge_alone(w, task.is_ordered).grade == "right"]
             differences = [agreement(right[0], w) for w in right[1:]]
-            is_settled = bool(right) and all(d is not None and agrees(d) for d in differences)
+            is_settled = bool(right) and all(d is not None and d.is_same for d in differences)
     focals, is_part, failed = {}, len(task.placed) < len(task.offered), None
     if candidates and task.free.lens:
         best = best_first(candidates, task.is_ordered)[0].model
@@ -366,19 +355,15 @@ def _start_from(task: Task, name: str, focals: Mapping[int, float]) -> Path:
 def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[str], task: Task) -> list[Witness]:
     """Runs the global mapper on some images from all starts in parallel on all cores; failed starts are left out."""
     cores = task.threads if task.threads > 0 else os.cpu_count() or 1
-    workers = min(cores, len(starts))
-
-    def run(start: tuple[str, dict[int, float]]) -> pycolmap.Reconstruction | None:
-        model = map_globally(task, *start, names, max(1, cores // workers))
-        advance()
-        return model
-
+    workers, models = min(cores, len(starts)), []
     with (
         progress("Global mapping", len(starts)) as advance,
         quiet(),  # outermost: each mapper's own would end before the other is done
         ThreadPoolExecutor(workers) as pool,
     ):
-        models = list(pool.map(run, starts))
+        for model in pool.map(lambda s: map_globally(task, s[0], s[1], names, max(1, cores // workers)), starts):
+            models.append(model)
+            advance()
     candidates = []
     for (name, _), model in zip(starts, models, strict=True):
         if model is None:

@@ -15,7 +15,8 @@ from rich.progress import track
 from mmpi_ns.capture.moving import draw_moving, find_moving, in_image
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import straightened_color
-from mmpi_ns.prepare.images import Photo, read_intrinsics
+from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.poses import opencv_intrinsics
 
 
 def write_masks(
@@ -27,19 +28,10 @@ def write_masks(
     picture: Path,
     threads: int,
 ) -> dict[str, float]:
-    """Finds what moves in the training images; where anything does, writes a mask for each photo and a picture.
+    """Finds what moves in the training images, which alone are compared; where anything does, writes a mask for each
+    photo, ``target/NAME.png``, white where used and of test images, and a picture.
 
-    Args:
-        model: poses, cameras and points.
-        photos: all that get a mask, ``target/NAME.png``: white is used. Those of test images are white.
-        train: names of the training images, which alone are compared.
-        images: folder of the images.
-        target: folder for the masks.
-        picture: file for the picture.
-        threads: processor threads; below 1 for all.
-
-    Returns:
-        The share that is masked of each image in which something moves, by name.
+    Returns the share that is masked of each image in which something moves, by name.
     """
     if threads > 0:
         torch.set_num_threads(threads)
@@ -71,13 +63,13 @@ def write_masks(
 
 def _posed_images(model: pycolmap.Reconstruction, entries: Sequence[pycolmap.Image], folder: Path) -> PosedImages:
     cameras = [model.cameras[entry.camera_id] for entry in entries]
-    lenses = [read_intrinsics(camera) for camera in cameras]
+    lenses, fisheye = zip(*map(opencv_intrinsics, cameras), strict=True)
     poses = np.array([entry.cam_from_world().inverse().matrix() for entry in entries], np.float64)
     return PosedImages(
         files=tuple(folder / entry.name for entry in entries),
         camera_to_worlds=poses @ np.diag([1.0, -1.0, -1.0, 1.0]),
-        intrinsics=np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses]),
+        intrinsics=np.array(lenses)[:, :4],
         sizes=np.array([[camera.width, camera.height] for camera in cameras], np.float64),
-        distortion=np.array([lens.distortion for lens in lenses]),
-        fisheye=np.array([lens.fisheye for lens in lenses]),
+        distortion=np.array(lenses)[:, 4:],
+        fisheye=np.array(fisheye),
     )

@@ -20,22 +20,21 @@ import pycolmap
 from filelock import FileLock, Timeout
 from scipy.cluster.hierarchy import DisjointSet
 
-from mmpi_ns.capture.matching import new_model, rigid3d
-from mmpi_ns.capture.sfm import load_pycolmap
+from mmpi_ns.capture.sfm import load_pycolmap, new_model, rigid3d
 from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images
-from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval, map_known_poses
-from mmpi_ns.prepare.alignment import camera_poses, choose_frame
-from mmpi_ns.prepare.images import Photo, in_short, make_cameras, parse_camera
+from mmpi_ns.prepare.adjustment import Free, camera_poses, choose_frame, focal_interval, map_known_poses
+from mmpi_ns.prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_ns.prepare.mapping import Task, map_and_judge
-from mmpi_ns.prepare.poses import read_poses
+from mmpi_ns.prepare.poses import make_cameras, parse_camera, read_poses
 from mmpi_ns.prepare.settings import Settings, check_settings, read_lists
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
-from mmpi_ns.prepare.video import select_frames
 from mmpi_ns.utils.errors import InputError, progress, quoted, say
 from mmpi_ns.utils.files import whole, write_text
 
 WORK = ".prepare"
+WORDS = {"input": "reading", "masks": "reading", "features": "features", "matches": "matching", "model": "mapping"}
+"""The stages in words, for the times in the report."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
@@ -63,21 +62,17 @@ class Preparation:
     def run(self) -> Verdict:
         """Input to scene; how far it can be believed."""
         s = self.settings
-        with self._timed("reading"):
-            self._read()
-        with self._timed("features"):
-            source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
-            cameras = self.numbers, self.cameras
-            how = self.image_folder, self.photos, cameras, self.masks, s.max_features, s.threads
-            folder, _ = self._stage("features", source, partial(features.extract, *how))
-        with self._timed("matching"):
-            poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
-            source = [s.matching, s.overlap, poses]
-            folder, self.matching = self._stage("matches", source, partial(self._match, folder / features.DATABASE))
-            say(f"Matching: {self.matching}.")
-        with self._timed("mapping"):
-            source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
-            folder, self.mapped = self._stage("model", source, partial(self._map, folder / features.DATABASE))
+        self._read()
+        source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
+        cameras = self.numbers, self.cameras
+        how = self.image_folder, self.photos, cameras, self.masks, s.max_features, s.threads
+        folder, _ = self._stage("features", source, partial(features.extract, *how))
+        poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
+        source = [s.matching, s.overlap, poses]
+        folder, self.matching = self._stage("matches", source, partial(self._match, folder / features.DATABASE))
+        say(f"Matching: {self.matching}.")
+        source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
+        folder, self.mapped = self._stage("model", source, partial(self._map, folder / features.DATABASE))
         model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
         count, total = model.num_reg_images(), len(self.photos)
         if count < LEAST_SHARE * total and not s.allow_partial:
@@ -95,36 +90,27 @@ class Preparation:
         return self._write(model, verdict)
 
     def _stage(self, name: str, settings: Any, make: Callable[[Path], Any]) -> tuple[Path, Any]:
-        """A stage's own folder, and what the work on it returned, now or before.
-
-        Args:
-            name: the folder's name.
-            settings: everything the result depends on besides the earlier stages; JSON or text.
-            make: fills the folder, and returns JSON.
-        """
+        """A stage's own folder, and the JSON that ``make``, which fills the folder, returned now or before: by these
+        settings, which are all that it depends on besides the earlier stages."""
         text = self.key + name + json.dumps(settings, sort_keys=True, default=str)
         self.key = hashlib.sha256(text.encode()).hexdigest()
-        folder, stamp = self.work / name, self.work / f"{name}.json"
+        folder, stamp, start = self.work / name, self.work / f"{name}.json", time.monotonic()
         try:
             state = json.loads(stamp.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             state = {}  # missing or truncated: the stage starts over
         if state.get("key") != self.key:
             shutil.rmtree(folder, ignore_errors=True)
-            write_text(stamp, json.dumps({"key": self.key}))
-        elif "result" in state:
+            state = {"key": self.key}
+            write_text(stamp, json.dumps(state))
+        if "result" in state:
             say(f"{name}: done before", "dim")
-            return folder, state["result"]
-        folder.mkdir(exist_ok=True)
-        result = make(folder)
-        write_text(stamp, json.dumps({"key": self.key, "result": result}))
-        return folder, result
-
-    @contextmanager
-    def _timed(self, name: str) -> Iterator[None]:
-        start = time.monotonic()
-        yield
-        self.times[name] = time.monotonic() - start
+        else:
+            folder.mkdir(exist_ok=True)
+            state["result"] = make(folder)
+            write_text(stamp, json.dumps(state))
+        self.times[WORDS[name]] = self.times.get(WORDS[name], 0.0) + time.monotonic() - start
+        return folder, state["result"]
 
     def _read(self) -> None:
         """Images, masks and known poses, whether the images come in the order of the motion, and their cameras with
@@ -136,13 +122,11 @@ class Preparation:
         files = [s.input] if self.is_video else images.find_images(s.input)
         source = [(str(p), p.stat().st_size, p.stat().st_mtime) for p in files]
         source = [*source[0], s.max_frames, s.frame_motion] if self.is_video else source
-
-        def read(folder: Path) -> list[dict[str, Any]]:
-            if self.is_video:
-                return [asdict(p) for p in select_frames(s.input, folder, s.max_frames, s.frame_motion)]
-            return [asdict(p) for p in images.gather(s.input, files, folder)]
-
-        self.photos = [Photo(**entry) for entry in self._stage("input", source, read)[1]]
+        read = partial(images.gather, s.input, files)
+        if self.is_video:
+            read = partial(select_frames, s.input, max_frames=s.max_frames, step=s.frame_motion)
+        _, entries = self._stage("input", source, lambda folder: [asdict(photo) for photo in read(folder)])
+        self.photos = [Photo(**entry) for entry in entries]
         self.is_ordered = self.is_video or features.are_numbered([p.name for p in self.photos])
         self.masks = None
         if s.masks is not None:
@@ -238,13 +222,16 @@ class Preparation:
             folder, masks = flat / "images", flat / "masks" if masks else None
         export.write_images(folder, masks, photos, built, s.downscales)
         notes = {"unit": unit, "up": up, "mapping": says, "matching": self.matching}
-        export.write_scene(model, built, export.transforms(model, split, masks is not None, notes))
+        (built / "colmap/sparse/0").mkdir(parents=True)
+        model.write(built / "colmap/sparse/0")
+        model.export_PLY(built / "sparse_pc.ply")
+        write_text(built / "transforms.json", json.dumps(export.transforms(model, split, bool(masks), notes), indent=1))
         rows = {
             "images registered": f"{len(photos)} of {len(self.photos)}",
             "matching": self.matching,
             "mapping": says,
             "verdict": f"{verdict.grade} {verdict.says}".strip(),
-            "focal length": focal_in_words(*self.mapped["focal"]) if self.mapped["focal"] else "given",
+            "focal length": self.mapped["focal"][1] if self.mapped["focal"] else "given",
             "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
             "what moves": moves,
             "up": up,
@@ -283,7 +270,7 @@ class Preparation:
                 gray = cv2.imread(str(self.image_folder / name), cv2.IMREAD_GRAYSCALE)
                 if gray is None:
                     raise InputError(f"{name} cannot be read: repair or remove it.")
-                sharp[i] = checks.sharpness(gray)  # type: ignore[arg-type]
+                sharp[i] = sharpness(gray)  # type: ignore[arg-type]
                 advance(1)
         findings += checks.blurred(names, sharp, self.is_ordered)
         if self.is_ordered:
@@ -328,7 +315,7 @@ class Preparation:
             say(f"This scene is {verdict.grade}: {verdict.says} {REMEDY}", "bold red")
         say(
             f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
-            f"{len(split.train)} train, {len(split.test)} test; checks.md says more. Train with:",
+            f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
             "bold red" if not is_right else "" if findings else "green",
         )
         say(f"ns-train mmpi-small --data {quoted(scene)}")

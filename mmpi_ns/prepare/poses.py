@@ -1,4 +1,5 @@
-"""Known poses: KITTI, TUM, transforms.json and 4x4 text files, matched with the images."""
+"""The cameras that SfM starts from, and known poses: KITTI, TUM, transforms.json, 4x4 text files, matched with the
+images."""
 
 from __future__ import annotations
 
@@ -7,20 +8,90 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
 
-from mmpi_ns.prepare.alignment import Array, nearest_rotation
-from mmpi_ns.prepare.images import IMAGES, Intrinsics, Photo, natural_key
+from mmpi_ns.prepare.adjustment import Array, nearest_rotation
+from mmpi_ns.prepare.images import IMAGES, Photo, natural_key
 from mmpi_ns.utils.errors import InputError, say
 
+Lens = Literal["auto", "pinhole", "radial", "opencv", "fisheye"]
+Sharing = Literal["auto", "shared", "per-image"]
+MODELS = {"pinhole": "PINHOLE", "radial": "SIMPLE_RADIAL", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+GUESSED_FOCAL = 1.2
+"""Focal length over the longer side if nothing is known: COLMAP's guess."""
+GIVEN_COUNTS = {3: "f cx cy", 4: "fx fy cx cy", 8: "fx fy cx cy k1 k2 p1 p2"}
 MAX_LAG = 0.05
 """Maximum time in seconds between an image and its pose."""
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 KIND = re.compile(r"[._-]?(pose|color|rgb|image)s?$", re.IGNORECASE)
 """End of a name that differs between images and poses: frame-000001.color.png, frame-000001.pose.txt."""
+
+
+def opencv_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:
+    """A camera of no size by fx, fy, cx, cy and the terms of its lens, k1, k2, p1, p2 or k1 to k4 of a fisheye; a
+    pinhole where there are none."""
+    model = "OPENCV_FISHEYE" if fisheye else "OPENCV" if any(values[4:]) else "PINHOLE"
+    return pycolmap.Camera(model=model, params=[*values, 0.0, 0.0, 0.0, 0.0][: 4 if model == "PINHOLE" else 8])
+
+
+def parse_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:
+    """The camera of ``--camera``. Raises InputError if the numbers fit none or a focal length is not positive."""
+    if len(values) not in GIVEN_COUNTS:
+        raise InputError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
+    if len(values) == 3:
+        values = (values[0], *values)
+    if min(values[:2]) <= 0:
+        raise InputError("--camera: focal lengths must be positive, in pixels.")
+    return opencv_camera(values, fisheye)
+
+
+def make_cameras(
+    photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, pycolmap.Camera], focal: float | None, lens: Lens
+) -> tuple[list[int], list[pycolmap.Camera]]:
+    """Cameras from given intrinsics (``lenses`` by image name, ``focal`` in pixels), else from EXIF, else guessed;
+    images of one size, lens and known intrinsics share one, unless ``sharing`` says otherwise.
+
+    Returns the camera of each image, numbered from 1, and the cameras in this order. Raises InputError if images of
+    different sizes are to share one.
+    """
+    sizes = {(p.width, p.height) for p in photos}
+    if sharing == "shared" and len(sizes) > 1:
+        listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        raise InputError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
+    by_key: dict[Any, int] = {}
+    numbers: list[int] = []
+    cameras: list[pycolmap.Camera] = []
+    for photo in photos:
+        known = lenses.get(photo.name)
+        given = known and (known.model.name, *known.params)
+        key = (photo.width, photo.height, "" if sharing == "shared" else photo.lens, given)
+        number = by_key.setdefault(photo.name if sharing == "per-image" else key, len(cameras) + 1)
+        numbers.append(number)
+        if number <= len(cameras):
+            continue
+        if known is not None:
+            size = {"width": photo.width, "height": photo.height, "camera_id": number}
+            camera = pycolmap.Camera(model=known.model, params=known.params, **size)
+        else:
+            model = MODELS["radial" if lens == "auto" and focal is None else "pinhole" if lens == "auto" else lens]
+            guess = focal or photo.exif_focal or GUESSED_FOCAL * max(photo.width, photo.height)
+            camera = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
+        camera.has_prior_focal_length = bool(known or focal or photo.exif_focal)
+        cameras.append(camera)
+    return numbers, cameras
+
+
+def opencv_intrinsics(camera: pycolmap.Camera) -> tuple[list[float], bool]:
+    """The numbers of ``opencv_camera``, eight of them, and whether it is a fisheye. Raises InputError if
+    nerfstudio-data does not support the lens model."""
+    name, terms = camera.model.name, [float(v) for v in camera.params[camera.extra_params_idxs()]]
+    if name not in (*MODELS.values(), "SIMPLE_PINHOLE", "RADIAL"):
+        raise InputError(f"Lens model {name} is not supported in transforms.json.")
+    f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
+    return [*f, *terms, 0.0, 0.0, 0.0, 0.0][:8], name == "OPENCV_FISHEYE"
 
 
 @dataclass(frozen=True)
@@ -31,23 +102,15 @@ class KnownPoses:
     """Camera to world, OpenCV axes (x right, y down, z forward). [4, 4]"""
     says: str
     """Format and how images were matched, in words."""
-    intrinsics: dict[str, Intrinsics] = field(default_factory=dict)
+    intrinsics: dict[str, pycolmap.Camera] = field(default_factory=dict)
     """Of the same images, from a transforms.json."""
     split: dict[str, Any] | None = None
     """A transforms.json's lists of files."""
 
 
 def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
-    """Reads known poses and matches them with the images.
-
-    Args:
-        path: a file, or a folder of 4x4 text files.
-        axes: opencv, opengl, or auto (opengl for transforms.json only).
-        photos: the images.
-
-    Raises:
-        InputError: the file is not understood, or fits fewer than two images.
-    """
+    """Reads known poses, a file or a folder of 4x4 text files, and matches them with the images. Raises InputError if
+    they are not understood, or fit fewer than two images."""
     is_transforms = path.suffix.lower() == ".json"
     if path.is_dir() or is_transforms:
         read = (_read_transforms if is_transforms else _read_matrices)(path, photos)
@@ -179,8 +242,8 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
                     raise InputError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
                 fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
                 cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
-                lens = tuple(float(frame.get(k, 0.0)) for k in keys)
-                intrinsics[photo.name] = Intrinsics(fx * sx, fy * sy, cx * sx, cy * sy, lens, fisheye)  # type: ignore[arg-type]
+                values = (fx * sx, fy * sy, cx * sx, cy * sy, *(float(frame.get(k, 0.0)) for k in keys))
+                intrinsics[photo.name] = opencv_camera(values, fisheye)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
     split = meta if "train_filenames" in meta and "test_filenames" in meta else None

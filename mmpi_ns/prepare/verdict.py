@@ -11,7 +11,6 @@ import numpy as np
 
 from mmpi_ns.prepare.evidence import (
     FEW,
-    Agreement,
     Array,
     Witness,
     agreement,
@@ -25,21 +24,15 @@ from mmpi_ns.prepare.images import in_short
 Grade = Literal["right", "doubtful", "broken"]
 ORDER: tuple[Grade, ...] = ("right", "doubtful", "broken")
 
-TRACKED = (0.55, 0.3)
-"""Share of all verified matches that must have become points: below the first doubtful, below the second broken."""
-FITTING = (0.9, 0.5)
-"""Share of the matches on or close beside their epipolar lines that must lie on them: where many are beside, the track
-is bent. (Matches far off are false, or belong to what moves.)"""
-FITTING_ACROSS = (0.83, 0.5)
-"""The same across each gap between frames."""
-HELD_ACROSS = (0.5, 0.25)
-"""Share of all matches across each gap that must lie on their epipolar lines: false matches are fewer."""
-HELD_BY_SIDE = (0.4, 0.15)
-"""Share of an image's matches with earlier, or with later, images that must lie on their epipolar lines."""
-BRIDGED = (0.5, 0.25)
-"""Share of the matches across each gap between frames that must have become points..."""
-BRIDGED_OF_USUAL = (0.6, 0.35)
-"""... and the same as a share of what the other gaps have."""
+TRACKED, BRIDGED, BRIDGED_OF_USUAL = (0.55, 0.3), (0.5, 0.25), (0.6, 0.35)
+"""Share of the verified matches that must have become points, of all and of those across each gap between frames, and
+the latter as a share of what others have. Like all pairs here: doubtful below the first, broken below the second."""
+FITTING, FITTING_ACROSS = (0.9, 0.5), (0.83, 0.5)
+"""Share of the matches on or close beside their epipolar lines that must lie on them, of all and across each gap: where
+many are beside, the track is bent. (Matches far off are false, or belong to what moves.)"""
+HELD_ACROSS, HELD_BY_SIDE = (0.5, 0.25), (0.4, 0.15)
+"""Share of all matches that must lie on their epipolar lines: of those across each gap, as false matches are fewer, and
+of an image's matches with earlier, or with later, images."""
 EDGE = 3
 """Number of images at either end of the track where a break means little."""
 SCALE = (0.03, 0.2)
@@ -52,10 +45,6 @@ CHANGE = 2.5
 """Ratio of speeds that counts as a sudden change, treated alike."""
 WEAK = 0.8
 """Share of the usual below which matches hold badly beside a jump."""
-APART = (0.01, 0.03)
-"""Mean and largest distance between the centres of two mappers, as shares of the track, up to which they agree."""
-TURNED = (1.0, 2.0)
-"""The same of their rotations, in degrees."""
 NEARLY_ALL = 0.9
 """Share of the images of the largest track below which another has clearly fewer."""
 REMEDY = (
@@ -79,12 +68,7 @@ def worse(value: float, limits: tuple[float, float]) -> Grade:
 
 
 def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
-    """The verdict on a mapper's model by its own evidence.
-
-    Args:
-        witness: of the mapper.
-        is_sequence: the images are in the order of the drive or walk.
-    """
+    """The verdict on a mapper's model by its own evidence; a sequence has its images in the order of the motion."""
     pairs, count = witness.pairs, len(witness.images)
     tracked, fitting = share(pairs.tracked, pairs.matches), share(pairs.fitting, pairs.fitting + pairs.beside)
     problems: list[tuple[Grade, str]] = [
@@ -162,15 +146,6 @@ def _leaps(witness: Witness, across: Array, between: Sequence[str]) -> list[tupl
     return problems
 
 
-def agrees(difference: Agreement) -> bool:
-    """Whether two mappers found the same track."""
-    centers, turns = difference.centers, difference.turns
-    return all(
-        values.mean() <= limits[0] and values.max() <= limits[1]
-        for values, limits in ((centers, APART), (turns, TURNED))
-    )
-
-
 def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool) -> Verdict:
     """The verdict on the chosen model, given those of the other mapper and from other focal lengths.
 
@@ -180,11 +155,11 @@ def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool
     """
     alone = judge_alone(chosen, is_sequence)
     compared = [(other, d) for other in others if (d := agreement(chosen, other)) is not None]
-    is_confirmed = any(agrees(d) and other.name != chosen.name for other, d in compared)
+    is_confirmed = any(d.is_same and other.name != chosen.name for other, d in compared)
     against = [
         (other, d)
         for other, d in compared
-        if not agrees(d)
+        if not d.is_same
         and (
             (judge_alone(other, is_sequence).grade == "right" and not (is_confirmed and _fit(other) < _fit(chosen)))
             or (alone.grade != "right" and not is_confirmed)
@@ -214,12 +189,10 @@ def best_first(witnesses: Sequence[Witness], is_sequence: bool) -> list[Witness]
     is seldom wrong. Then by verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by
     matches that became points. (A bent track may have more points than a right one: its points fit its bends.)
     """
-    graded: list[tuple[Grade, Witness]] = [(judge_alone(witness, is_sequence).grade, witness) for witness in witnesses]
-    most = max((len(witness.images) for grade, witness in graded if grade != "broken"), default=0)
-
-    def key(pair: tuple[Grade, Witness]) -> tuple[bool, bool, int, int, float, float]:
-        grade, witness = pair
-        size, tracked = len(witness.images), float(witness.pairs.tracked.sum())
-        return grade != "broken", size >= NEARLY_ALL * most, -ORDER.index(grade), size, _fit(witness), tracked
-
-    return [witness for _, witness in sorted(graded, key=key, reverse=True)]
+    grades, sizes = [judge_alone(w, is_sequence).grade for w in witnesses], [len(w.images) for w in witnesses]
+    most = max((size for grade, size in zip(grades, sizes, strict=True) if grade != "broken"), default=0)
+    credits = [
+        (g != "broken", n >= NEARLY_ALL * most, -ORDER.index(g), n, _fit(w), float(w.pairs.tracked.sum()))
+        for g, n, w in zip(grades, sizes, witnesses, strict=True)
+    ]
+    return [witnesses[i] for i in sorted(range(len(credits)), key=credits.__getitem__, reverse=True)]

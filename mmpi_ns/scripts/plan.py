@@ -81,9 +81,9 @@ class PlanCommand:
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
         """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""
+        from mmpi_ns.placement.observations import find_visible_points
         from mmpi_ns.placement.show import draw_errors, draw_plan, draw_windows, explain, table
         from mmpi_ns.placement.split import cameras_of, of_cameras
-        from mmpi_ns.placement.visibility import find_visible_points
 
         parts = []
         for i, window in enumerate(windows.windows):

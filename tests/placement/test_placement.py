@@ -9,9 +9,8 @@ import pytest
 from reprojection import median_reprojection_error
 
 from mmpi_ns.placement.errors import mpi_errors, pixel_errors
-from mmpi_ns.placement.observations import Observations, add_swept_points
+from mmpi_ns.placement.observations import Observations, add_swept_points, find_visible_points, pixels_per_pixel
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import find_visible_points, pixels_per_pixel
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 FOCAL, WIDTH, HEIGHT = 180.0, 310.0, 94.0

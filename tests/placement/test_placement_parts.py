@@ -14,9 +14,8 @@ from mmpi_ns.placement import candidates as candidates_module
 from mmpi_ns.placement import rule
 from mmpi_ns.placement.candidates import Candidate, find_candidates
 from mmpi_ns.placement.errors import PixelErrors, cube_errors, mpi_errors
-from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
 from mmpi_ns.placement.rule import PlacementConfig, _Choice, place
-from mmpi_ns.placement.visibility import find_visible_points, pixels_per_pixel
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 
@@ -157,7 +156,7 @@ def candidate(texel, plane=None, rows=100.0, frame=None) -> Candidate:
 def chosen(candidates, weight=10.0, **changes):
     """The heads, with texels of two pixels, planes for one pixel, and so much weight for every observation."""
     config = PlacementConfig(plane_pixels=0.5, texel_pixels=2.0, max_voxels=128, **changes)
-    return _Choice(candidates, np.full(len(candidates[0].texel), weight), config, 2.0).run().heads(config, 2.0)
+    return _Choice(candidates, np.full(len(candidates[0].texel), weight), config, 2.0).heads(2.0)
 
 
 def marked(number):
@@ -217,10 +216,7 @@ def test_the_finest_texels_within_the_budget_are_kept_and_the_coarsest_where_non
         def __init__(self, candidates, weights, config, texel_pixels):
             tried.append(texel_pixels)
 
-        def run(self):
-            return self
-
-        def heads(self, config, texel_pixels):
+        def heads(self, texel_pixels):
             side = 10 if texel_pixels >= finest else 100
             return [mpi(planes=2, height=side, width=side)]
 

@@ -12,9 +12,8 @@ from still_life import still_life
 
 from mmpi_ns.placement.candidates import find_candidates
 from mmpi_ns.placement.errors import WORST, cube_errors, mpi_errors
-from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.observations import Observations, find_visible_points
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_scene.catalogue import make_scene
 

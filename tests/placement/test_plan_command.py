@@ -13,9 +13,9 @@ from procedural import observations_of
 
 from mmpi_ns.config import mmpi, mmpi_small
 from mmpi_ns.placement.defaults import DEFAULTS
+from mmpi_ns.placement.observations import find_visible_points
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.placement.show import describe_facing, explain, table
-from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.plan import _defaults, entrypoint
 from mmpi_ns.utils.errors import InputError

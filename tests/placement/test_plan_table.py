@@ -10,10 +10,9 @@ import pytest
 from seen_points import FX, FY, HEIGHT, WIDTH, mpi, observed, turned_about_y
 
 from mmpi_ns.placement.errors import WORST, pixel_errors
-from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.observations import Observations, find_visible_points
 from mmpi_ns.placement.rule import PlacementConfig, place, widened
 from mmpi_ns.placement.show import explain, table
-from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 

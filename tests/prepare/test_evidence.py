@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from sound_track import FOCAL, drive, observed, project, scattered, triangulated, witness_with
 
-from mmpi_ns.prepare.alignment import rotation_between
+from mmpi_ns.prepare.adjustment import rotation_between
 from mmpi_ns.prepare.evidence import (
     Pairs,
     Witness,

@@ -12,10 +12,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.capture.matching import count_features
+from mmpi_ns.capture.sfm import count_features
 from mmpi_ns.prepare import adjustment, features, mapping
-from mmpi_ns.prepare.adjustment import Free, with_all_points, with_fewer_points
-from mmpi_ns.prepare.alignment import camera_poses, similarity_between
+from mmpi_ns.prepare.adjustment import Free, camera_poses, similarity_between, with_all_points, with_fewer_points
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.pipeline import WORK, prepare

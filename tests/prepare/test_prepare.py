@@ -16,7 +16,7 @@ from reprojection import median_reprojection_error
 from mmpi_ns.capture.observe import read_observations
 from mmpi_ns.capture.sfm import find_sfm_model
 from mmpi_ns.prepare import features, mapping
-from mmpi_ns.prepare.alignment import camera_poses, similarity_between
+from mmpi_ns.prepare.adjustment import camera_poses, similarity_between
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
 

@@ -15,19 +15,20 @@ from mmpi_ns.prepare import checks, export, features
 from mmpi_ns.prepare.checks import exposure_in_words
 from mmpi_ns.prepare.images import (
     Photo,
+    choose_frames,
     find_images,
     gather,
     gather_masks,
-    make_cameras,
+    measure,
     open_image,
-    parse_camera,
-    read_intrinsics,
     reads_heif,
     scene_names,
+    select_frames,
+    sharpness,
 )
 from mmpi_ns.prepare.pipeline import prepare
+from mmpi_ns.prepare.poses import make_cameras, opencv_intrinsics, parse_camera
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.video import choose_frames, measure, select_frames
 from mmpi_ns.utils.errors import InputError
 
 
@@ -197,7 +198,7 @@ def test_focal_length_comes_from_the_option_then_exif_then_a_guess():
 def test_given_camera_comes_back_from_colmaps():
     given = parse_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
     (camera,) = make_cameras([Photo("a", 100, 50)], "auto", {"a": given}, None, "auto")[1]
-    assert read_intrinsics(camera) == given
+    assert opencv_intrinsics(camera) == ([90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004], False)
     with pytest.raises(InputError, match="--camera takes"):
         parse_camera((1.0, 2.0), fisheye=False)
 
@@ -386,5 +387,5 @@ def test_jump_and_turn_of_the_track_are_found():
 def test_blurred_image_is_found():
     images = [cv2.cvtColor(corridor.picture(p), cv2.COLOR_RGB2GRAY) for p in corridor.poses(6)]
     images[3] = cv2.GaussianBlur(images[3], (0, 0), 2)
-    sharp = np.array([checks.sharpness(i) for i in images])
+    sharp = np.array([sharpness(i) for i in images])
     assert [f.image for f in checks.blurred(list("abcdef"), sharp, True)] == ["d"]

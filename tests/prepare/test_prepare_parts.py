@@ -12,12 +12,11 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.capture.matching import rigid3d
+from mmpi_ns.capture.sfm import rigid3d
 from mmpi_ns.prepare import export, features, mapping
-from mmpi_ns.prepare.adjustment import Free, adjust, is_bent, polish, quality
-from mmpi_ns.prepare.alignment import choose_frame, similarity_between
-from mmpi_ns.prepare.images import Intrinsics, Photo, make_cameras, read_intrinsics
-from mmpi_ns.prepare.video import choose_frames, median_motion
+from mmpi_ns.prepare.adjustment import Free, adjust, choose_frame, is_bent, polish, quality, similarity_between
+from mmpi_ns.prepare.images import Photo, choose_frames, median_motion
+from mmpi_ns.prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
 from mmpi_ns.utils.errors import InputError
 
 
@@ -131,28 +130,28 @@ SIZE = {"width": 200, "height": 160, "camera_id": 1}
 )
 def test_a_lens_of_colmap_projects_as_opencv_says(model, params):
     camera = pycolmap.Camera(model=model, params=params, **SIZE)
-    lens = read_intrinsics(camera)
+    (fx, fy, cx, cy, *terms), is_fisheye = opencv_intrinsics(camera)
     rays = np.array([[0.3, -0.2, 1.0], [-0.4, 0.35, 1.0], [0.1, 0.4, 1.0]])
-    matrix, still = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]), np.zeros(3)
-    project = cv2.fisheye.projectPoints if lens.fisheye else cv2.projectPoints
-    args = (still, still, matrix, np.array(lens.distortion))
-    wanted = (project(rays[None], *args) if lens.fisheye else project(rays, *args))[0].reshape(-1, 2)
+    matrix, still = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
+    project = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
+    args = (still, still, matrix, np.array(terms))
+    wanted = (project(rays[None], *args) if is_fisheye else project(rays, *args))[0].reshape(-1, 2)
     assert camera.img_from_cam(rays) == pytest.approx(wanted, abs=1e-6)
 
 
 def test_a_lens_without_a_place_in_transforms_is_named():
     with pytest.raises(InputError, match="FULL_OPENCV"):
-        read_intrinsics(pycolmap.Camera(model="FULL_OPENCV", params=[150, 140, 98, 83, *[0.0] * 8], **SIZE))
+        opencv_intrinsics(pycolmap.Camera(model="FULL_OPENCV", params=[150, 140, 98, 83, *[0.0] * 8], **SIZE))
 
 
 def test_given_lenses_are_kept_apart_and_come_back_from_colmaps():
     photos = [Photo(name, 200, 160, source=name) for name in "abcd"]
-    first = Intrinsics(150.0, 140.0, 98.0, 83.0, (0.1, -0.05, 0.02, -0.01), fisheye=True)
-    given = {"a": first, "b": Intrinsics(150.0, 140.0, 98.0, 83.0), "c": first}
+    bent, flat = [150.0, 140.0, 98.0, 83.0, 0.1, -0.05, 0.02, -0.01], [150.0, 140.0, 98.0, 83.0]
+    given = {"a": opencv_camera(bent, True), "b": opencv_camera(flat, False), "c": opencv_camera(bent, True)}
     numbers, cameras = make_cameras(photos, "auto", given, 120.0, "auto")
     assert numbers == [1, 2, 1, 3] and [c.camera_id for c in cameras] == [1, 2, 3]
     assert [c.model.name for c in cameras[:2]] == ["OPENCV_FISHEYE", "PINHOLE"]
-    assert [read_intrinsics(c) for c in cameras[:2]] == [given["a"], given["b"]]
+    assert [opencv_intrinsics(c) for c in cameras[:2]] == [(bent, True), ([*flat, 0.0, 0.0, 0.0, 0.0], False)]
 
 
 # Files ---------------------------------------------------------------------------------------------------------------
