@@ -1,20 +1,16 @@
-"""Merged samples: their data from the sampler and their lookups in the field."""
+"""Lookups of merged samples in the field's tables."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
-from nerfstudio.cameras.rays import RaySamples
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import weigh_rows
-from mmpi_ns.ops.layout import Places
 
 
 @dataclass(frozen=True)
@@ -55,43 +51,3 @@ class Lookup:
         # Split, not sliced: the gradient of a slice is as large as the whole.
         parts = values.split([samples.stop - samples.start for _, samples in self.spans])
         return ((k, samples, part) for (k, samples), part in zip(self.spans, parts, strict=True))
-
-    def of_rays(self, chosen: Bool[Tensor, "R"]) -> Lookup:
-        """The samples of the chosen rays, or of all rays if choosing would synchronise with a GPU. Rows are still those
-        of all rays."""
-        if dispatch.on_device(chosen) or bool(chosen.all()):
-            return self
-        samples = chosen[self.rays].nonzero()[:, 0]
-        ends = torch.tensor([*accumulate(len(taps.positions) for taps in self.taps)])
-        bounds, taps = [0, *torch.searchsorted(samples, ends).tolist()], []
-        for each, end, (a, b) in zip(self.taps, ends.tolist(), pairwise(bounds), strict=True):
-            chosen_taps = samples[a:b] - (end - len(each.positions))
-            taps.append(Taps(*(x.index_select(0, chosen_taps) for x in (each.positions, each.weights))))
-        heads = self.heads[samples]
-        return replace(
-            self,
-            index=self.index[samples],
-            heads=heads,
-            planes=self.planes[samples],
-            ndc=self.ndc.index_select(0, samples),
-            spans=head_spans(torch.bincount(heads).tolist()),
-            taps=taps,
-        )
-
-
-def head_spans(counts: Sequence[int]) -> list[tuple[int, slice]]:
-    """(head, range of its samples) for every head that occurs among samples ordered by head."""
-    ends = list(accumulate(counts))
-    return [(k, slice(end - n, end)) for k, (n, end) in enumerate(zip(counts, ends, strict=True)) if n]
-
-
-def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
-    """Data of each merged sample from the sampler (see ``MMPISampler``)."""
-    assert ray_samples.metadata is not None, "these samples do not come from MMPISampler"
-    return ray_samples.metadata
-
-
-def places_of(ray_samples: RaySamples) -> Places:
-    """Positions of merged samples."""
-    meta = metadata_of(ray_samples)
-    return Places(meta["heads"][..., 0], meta["planes"][..., 0], meta["ndc"], meta["valid"][..., 0])

@@ -7,7 +7,6 @@ network shades the ray once. ``sample``: a network gives every sample its colour
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -90,19 +89,6 @@ class ColorNetworks(Networks):
         direction = positional_encoding(directions, self.direction_frequencies)
         direction = direction if rays is None else direction.index_select(0, rays)
         return sample_colors(self.layers(head), features, position, direction)
-
-
-@dataclass(frozen=True)
-class RayColors:
-    """Colours of rays without a background, and of the samples along them."""
-
-    rgb: Float[Tensor, "R 3"]
-    mass: Float[Tensor, "R 1"]
-    """Sum of the weights of the samples below. No gradient reaches the weights from here on."""
-    first: Float[Tensor, "R 3"]
-    """Sum of weight times colour of each sample."""
-    second: Float[Tensor, "R 3"]
-    """Sum of weight times squared colour."""
 
 
 class RayShader(Networks):

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from random_fields import CLEAR, ERROR, OracleRay, bundle, fill, random_plan, random_rays
+from random_fields import CLEAR, ERROR, OracleRay, bundle, fill, random_plan, random_rays, sampled
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.field.shading import RayShader, change_odds
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.composite import composite_weights
-from mmpi_ns.rendering.sampler import MMPISampler
 
 F64 = torch.float64
 
@@ -28,13 +27,11 @@ def ray_field(num_mpis=3, with_cube=True, seed=0, channels=7, **chosen):
 def shown(field, rays, gradients=False, chosen=None):
     """What the field's rays show, by the ways of training or of rendering."""
     with torch.set_grad_enabled(gradients):
-        samples, report = MMPISampler()(rays, field=field, threshold=0.0)
-        meta = metadata_of(samples)
-        tau, lookup = field.get_density(samples) if gradients else (meta["tau"], None)
-        made = composite_weights(
-            tau[..., 0], meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total
-        )
-        return field.render_colors(samples, lookup, made, chosen), made
+        _, samples = sampled(field, rays)
+        tau, lookup = field.get_density(rays, samples) if gradients else (samples.tau, None)
+        made = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
+        rgb, sums = field.render_colors(rays, samples, lookup, made, chosen)
+        return SimpleNamespace(rgb=rgb, **vars(sums)), made
 
 
 # By hand -------------------------------------------------------------------------------------------------------------

@@ -92,7 +92,7 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None =
     return HeadSamples(slots, heads[slots], planes, ndc, counts)
 
 
-@operation("gpu")
+@operation()
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
@@ -105,14 +105,11 @@ def texel_rows(
         planes: plane of each sample.
         ndc: position of each sample in its MPI.
     """
-    rows, weights = planes.new_zeros(len(heads), 4), ndc.new_zeros(len(heads), 4)
-    for k, grid in enumerate(layout.grids[: len(layout.mpis)]):
-        here = (heads == k).nonzero()[:, 0]
-        rows[here], weights[here] = grid.bilinear(planes[here], ndc[here])
-    return rows, weights
+    sizes = layout.once("sizes", lambda it: torch.tensor([g.sizes for g in it.grids], device=heads.device))
+    return layout.grids[0].with_sizes(sizes[heads]).bilinear(planes, ndc)
 
 
-@operation("gpu")
+@operation()
 def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) -> RowIndex:
     """Distinct rows of a list, rising.
 
@@ -122,10 +119,14 @@ def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) ->
         pads: row 0, which no entry refers to there, may follow the distinct rows any number of times. A GPU then
             need not be waited for to tell their number.
     """
-    return RowIndex(*torch.unique(rows, return_inverse=True))
+    listed, order = rows.reshape(-1).sort()
+    place = torch.diff(listed, prepend=listed[:1]).ne(0).cumsum(0)
+    count = len(listed) if pads or not len(listed) else int(place[-1]) + 1
+    unique = torch.zeros_like(listed).index_copy(0, place, listed)[:count]
+    return RowIndex(unique, torch.empty_like(place).index_copy(0, order, place).view(rows.shape))
 
 
-@operation("gpu")
+@operation()
 def sum_rows(
     positions: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"], count: int
 ) -> Float[Tensor, "U C"]:
@@ -157,7 +158,7 @@ def weigh_rows(
     return _WeighRows.apply(values, positions, weights.to(values.dtype))  # type: ignore[no-any-return]
 
 
-@operation("gpu")
+@operation()
 def weighted_rows(
     table: Float[Tensor, "T C"], rows: Int32[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
