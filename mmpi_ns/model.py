@@ -128,7 +128,7 @@ class MMPIModel(Model):
         self.details: Details | None = None
         self.metrics = ImageMetrics(config.lpips_net)
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
-        """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
+        """In place of ``scores_and_images`` while the pipeline evaluates images, which are exact then."""
         self.show = ViewerDropdown("Show MPI", "all", ["all"], hint="One MPI alone, or all")
         self._take_plan()
         dispatch.choose(config.ops)
@@ -266,7 +266,7 @@ class MMPIModel(Model):
         mode, first_head = self.config.rendering.mode, sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
-        may_bake = mode == "auto" and not self.trains and one_exposure
+        may_bake = mode == "auto" and not self.trains and one_exposure and self.scoring is None
         bundle = bounded(bundle, field.plan)
         if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
             rays = rays_of(bundle)

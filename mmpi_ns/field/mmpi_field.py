@@ -137,6 +137,12 @@ class MMPIField(TexelTables):
         """Factor on every optical depth of an MPI, from the current plan: that of a checkpoint has its own K."""
         return 1.0 / len(self.full_plan.mpis) if self.shares_depth else 1.0
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its tables, and of its bricks if it is baked."""
+        bricks = self.cached("baked")
+        return sum(x.nbytes for x in self.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
+
     def forget_baked(self) -> None:
         """Drops the baked window, because the field is about to be trained."""
         self._packed.pop(("baked", self.density.device), None)

@@ -6,9 +6,7 @@ resulting share depends on the position alone, so a baked texel stores the optic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -50,24 +48,11 @@ AT_ONCE_BRICKS = 2**13
 AT_ONCE = 2**18
 """Rays whose weights are looked at together: all of a photo of 12 megapixels would take gigabytes."""
 
-_measuring: ContextVar[bool] = ContextVar("measuring", default=False)
-
-
-@contextmanager
-def exact_images() -> Iterator[None]:
-    """Inside, ``render auto`` uses the exact renderer for images of this thread."""
-    token = _measuring.set(True)
-    try:
-        yield
-    finally:
-        _measuring.reset(token)
-
 
 def suits_bricks(model_field: MMPIField) -> bool:
-    """Decision of ``render auto`` for a field that is not training: bricks if compiled, on a CPU, not for metrics."""
-    if _measuring.get() or torch.is_grad_enabled() or why_not_baked(model_field):
-        return False
-    return dispatch.form_of("show_baked", model_field.features.data) == "cpu"
+    """Decision of ``render auto`` for a field that is neither trained nor scored: bricks if compiled, on a CPU."""
+    compiled = dispatch.form_of("show_baked", model_field.features.data) == "cpu"
+    return compiled and not torch.is_grad_enabled() and not why_not_baked(model_field)
 
 
 @dataclass(frozen=True, eq=False)

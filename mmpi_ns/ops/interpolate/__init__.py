@@ -14,9 +14,14 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor, nn
 
 from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds
-from mmpi_ns.ops.dispatch import in_cpp, operation
+from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
+
+MOST_ROWS = 2**31
+"""A bit is taken for every row of the table: beyond this, torch's sort."""
+AT_LEAST = 1 << 15
+"""Entries, samples or bricks that are worth another thread, whose start takes as long as a tenth of a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +150,7 @@ def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]
 
 
-@operation()
+@operation(in_cpp=AT_LEAST)
 def take_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     """Values of ``read_rows``."""
     return table.index_select(0, rows)
@@ -158,7 +163,7 @@ def weigh_rows(
     return _WeighRows.apply(values, positions, weights.to(values.dtype))  # type: ignore[no-any-return]
 
 
-@operation()
+@operation(in_cpp=AT_LEAST)
 def weighted_rows(
     table: Float[Tensor, "T C"], rows: Int32[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
@@ -208,12 +213,6 @@ class _WeighRows(torch.autograd.Function):
         to_values = sum_rows(positions, grad, weights, ctx.count) if ctx.needs_input_grad[0] else None
         to_weights = None if values is None else (values[positions] * grad[:, None]).sum(-1)
         return to_values, None, to_weights
-
-
-MOST_ROWS = 2**31
-"""A bit is taken for every row of the table: beyond this, torch's sort."""
-AT_LEAST = 1 << 15
-"""Entries, samples or bricks that are worth another thread, whose start takes as long as a tenth of a millisecond."""
 
 
 @order_by_head.on_cpu
@@ -267,7 +266,3 @@ def sum_rows_on_cpu(positions: Tensor, values: Tensor, weights: Tensor, count: i
     bounds = owned_bounds([positions], count, AT_LEAST)
     call_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
     return sums
-
-
-in_cpp(weighted_rows, AT_LEAST)
-in_cpp(take_rows, AT_LEAST)
