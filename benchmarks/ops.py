@@ -18,13 +18,12 @@ from report import Report, Row, page, slug, table, title
 from torch import Tensor
 
 from mmpi_ns.bench.trainers import Steps
-from mmpi_ns.field.samples import Lookup
+from mmpi_ns.field.tables import Lookup
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.ops.interpolate import Table, index_rows, read_rows, sum_rows, weigh_rows
 from mmpi_ns.ops.march import MergedSamples, march, merge
-from mmpi_ns.rendering.rendered import bounded
-from mmpi_ns.rendering.sampler import rays_of
+from mmpi_ns.rendering.rendered import bounded, rays_of
 from mmpi_ns.scripts.command import run
 
 COPIED = 1 << 26

@@ -22,8 +22,7 @@ from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.ops.march import MarchOptions, march
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.metrics import ImageMetrics
-from mmpi_ns.rendering.rendered import bounded
-from mmpi_ns.rendering.sampler import rays_of
+from mmpi_ns.rendering.rendered import bounded, rays_of
 from mmpi_ns.scene.windows import Window
 from mmpi_ns.scripts.command import run
 from mmpi_scene import catalogue

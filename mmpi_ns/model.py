@@ -38,11 +38,12 @@ from mmpi_ns.rendering.rendered import (
     RenderingConfig,
     background_of,
     bounded,
+    rays_of,
     render_rays,
     shown_outputs,
     winners,
 )
-from mmpi_ns.rendering.sampler import SamplingConfig, rays_of
+from mmpi_ns.rendering.sampler import SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews

@@ -17,7 +17,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights, render_colors
 from mmpi_ns.ops.march import MarchOptions, march
-from mmpi_ns.rendering.sampler import rays_of
+from mmpi_ns.rendering.rendered import rays_of
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 

@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from mmpi_ns.field.samples import Lookup
 from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
-from mmpi_ns.field.tables import TexelTables
+from mmpi_ns.field.tables import Lookup, TexelTables
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
 from mmpi_ns.ops.gather import COLORS, RaySums, Taps, gather_places, gather_taps

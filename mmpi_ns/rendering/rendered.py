@@ -13,13 +13,12 @@ from torch import Tensor
 
 from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import Lookup
 from mmpi_ns.field.shading import RayShader
+from mmpi_ns.field.tables import Lookup
 from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import Composite, composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.gather import RaySums
-from mmpi_ns.ops.march import MarchOptions, MergedSamples, march, show_rays
-from mmpi_ns.rendering.sampler import rays_of
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, march, show_rays
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
@@ -82,6 +81,13 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     bundle.nears = near if bundle.nears is None else torch.maximum(bundle.nears, near)
     bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars
     return bundle
+
+
+def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:
+    """Rays for the march, and the heads that may render them (see ``ops.march.Rays``)."""
+    nears, fars = ray_bundle.nears, ray_bundle.fars
+    assert nears is not None and fars is not None
+    return Rays(ray_bundle.origins, ray_bundle.directions, nears, fars, head_mask, choose)
 
 
 def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, first_head: int) -> dict[str, Tensor]:

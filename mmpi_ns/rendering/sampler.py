@@ -1,13 +1,10 @@
-"""Rays for the march, and which samples of a ray train (paper sec. III-B)."""
+"""Which samples of a ray train (paper sec. III-B)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from nerfstudio.cameras.rays import RayBundle
-from torch import Tensor
-
-from mmpi_ns.ops.march import MarchOptions, Rays
+from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.scene.plan import ScenePlan
 
 FAIR_SHARE = 0.1
@@ -32,10 +29,3 @@ class SamplingConfig:
         """
         cube = 0.1 * self.cube_alpha if forming and plan.cube is not None else float("inf")
         return MarchOptions(min(self.threshold, cube), FAIR_SHARE if forming else float("inf"), blends)
-
-
-def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:
-    """Rays for the march, and the heads that may render them (see ``ops.march.Rays``)."""
-    nears, fars = ray_bundle.nears, ray_bundle.fars
-    assert nears is not None and fars is not None
-    return Rays(ray_bundle.origins, ray_bundle.directions, nears, fars, head_mask, choose)

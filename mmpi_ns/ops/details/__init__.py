@@ -15,14 +15,9 @@ from mmpi_ns.ops.ends import numbers_in
 
 TEXT = (HEADERS / "details.h").read_text(encoding="utf-8")
 """Lines that both C++ and GLSL understand: the numbers below with what they mean, and the weights."""
-_NUMBERS = numbers_in(TEXT)
-TURN = _NUMBERS["TURN"]
-FADE = _NUMBERS["FADE"]
-SAME_DEPTH = _NUMBERS["SAME_DEPTH"]
-SAME_PIXELS = _NUMBERS["SAME_PIXELS"]
-STRENGTH = _NUMBERS["STRENGTH"]
-LEAST_WEIGHT = _NUMBERS["LEAST_WEIGHT"]
-TINY = _NUMBERS["TINY"]
+TURN, FADE, SAME_DEPTH, SAME_PIXELS, STRENGTH, LEAST_WEIGHT, TINY = numbers_in(
+    TEXT, "TURN", "FADE", "SAME_DEPTH", "SAME_PIXELS", "STRENGTH", "LEAST_WEIGHT", "TINY"
+)
 
 
 class SeenDetails(NamedTuple):

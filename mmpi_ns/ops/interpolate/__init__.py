@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int, Int32
@@ -32,18 +32,6 @@ class RowIndex:
     """Rising, except for padding."""
     positions: Int[Tensor, "..."]
     """Of every entry in ``unique``; int32 or int64."""
-
-
-class HeadSamples(NamedTuple):
-    """The valid samples of a batch: heads rising, and the slots of each head."""
-
-    slots: Int[Tensor, "N"]
-    """Flat slots [R, S] of the samples."""
-    heads: Int[Tensor, "N"]
-    planes: Int[Tensor, "N"]
-    ndc: Float[Tensor, "N 3"]
-    counts: Sequence[int]
-    """Samples of each head."""
 
 
 class Table(nn.Parameter):
@@ -78,13 +66,18 @@ class Table(nn.Parameter):
 
 
 @operation()
-def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
+def order_by_head(
+    places: Places, num_heads: int, counts: Sequence[int] | None = None
+) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "N"], Float[Tensor, "N 3"], Sequence[int]]:
     """Valid samples of a batch, ordered by head and otherwise by slot.
 
     Args:
         places: of the samples.
         num_heads: of the scene.
         counts: samples of each head, if known; otherwise this synchronises with a GPU.
+
+    Returns:
+        Flat slots [R, S] of the samples, their heads, planes and NDC, and how many there are of each head.
     """
     heads, valid = places.heads.reshape(-1), places.valid.reshape(-1)
     if counts is None:
@@ -94,7 +87,7 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None =
         keys = torch.where(valid, heads, num_heads)
         slots = torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)]
     planes, ndc = places.planes.reshape(-1)[slots], places.ndc.reshape(-1, 3)[slots]
-    return HeadSamples(slots, heads[slots], planes, ndc, counts)
+    return slots, heads[slots], planes, ndc, counts
 
 
 @operation()
@@ -216,7 +209,7 @@ class _WeighRows(torch.autograd.Function):
 
 
 @order_by_head.on_cpu
-def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
+def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> tuple:
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
@@ -227,7 +220,7 @@ def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] |
     slots, of_heads, of_planes = torch.empty(3, count, dtype=torch.int64)
     columns = (slots, of_heads, of_planes, torch.empty(count, 3))
     call_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
-    return HeadSamples(*columns, totals.tolist())
+    return *columns, totals.tolist()
 
 
 @texel_rows.on_cpu
