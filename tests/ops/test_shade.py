@@ -70,7 +70,7 @@ def test_colours_do_not_depend_on_the_number_of_threads():
 def test_colours_say_where_a_feature_is_not_a_number():
     field, samples = shaded()
     before = colors(field, samples).isnan().any(-1)
-    read = field._lookup(samples)
+    read = field._lookup(*samples)
     field.features.data[read.rows[read.taps[0].positions[3, 0]], 5] = math.nan
     found = colors(field, samples).isnan().any(-1)
     assert not before.any() and found.reshape(-1)[read.index[3]] and not found.all()
