@@ -23,7 +23,7 @@ from mmpi_ns.ops.gather import COLORS, RaySums, Taps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MergedSamples
-from mmpi_ns.ops.shade import SampleNetworks, shade
+from mmpi_ns.ops.shade import head_colors, shade
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.geometry import FACING_EPS, LocalRays, sample_disparity
@@ -194,19 +194,18 @@ class MMPIField(TexelTables):
             samples: of the rays.
             lookup: where they read the tables; None looks them up where gradients are asked for.
         """
-        directions, axes, networks = rays.directions, self.layout.frames.axes, self.networks
-        assert isinstance(networks, ColorNetworks), "rays that are shaded once have no colours of samples"
-        numbers = self.planned_heads(torch.arange(self.plan.num_heads)).tolist()  # a copy has its MPI's network
+        directions, axes = rays.directions, self.layout.frames.axes
+        assert isinstance(self.networks, ColorNetworks), "rays that are shaded once have no colours of samples"
+        # A copy has its MPI's network.
+        networks = self.networks.of_heads(self.planned_heads(torch.arange(self.plan.num_heads)).tolist())
         if self.layout.cube is not None:
             axes = torch.cat([axes, torch.eye(3, device=axes.device)[None]])
         if lookup is None and not torch.is_grad_enabled():
-            octaves = (networks.position_frequencies, networks.direction_frequencies)
-            of_heads = SampleNetworks(tuple(networks.layers(k) for k in numbers), *octaves)
-            return shade(self.layout, self.features.data, of_heads, axes, directions, samples.places)
+            return shade(self.layout, self.features.data, networks, axes, directions, samples.places)
         lookup = lookup or self._lookup(rays, samples)
         features = lookup.read(lookup.features)
         colors = [
-            networks(numbers[k], part, lookup.ndc[here], geometry.rotate(axes[k], directions), lookup.rays[here])
+            head_colors(networks, k, part, lookup.ndc[here], geometry.rotate(axes[k], directions), lookup.rays[here])
             for k, here, part in lookup.by_head(features)
         ]
         out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
