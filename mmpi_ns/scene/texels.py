@@ -11,8 +11,7 @@ tiles.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -62,16 +61,6 @@ class TexelGrid:
         tile = self.first_tile + (z * self.down + (y >> 3)) * self.across + (x >> 3)
         brick = self.tiles.index_select(0, tile.reshape(-1)).view(tile.shape)
         return (brick.to(torch.int64) << 6) + ((y & 7) << 3) + (x & 7)
-
-    @property
-    def sizes(self) -> tuple[int, int, int, int, int]:
-        """Rows and columns of texels and of tiles, and the first tile."""
-        return self.height, self.width, self.down, self.across, self.first_tile
-
-    def with_sizes(self, sizes: Int[Tensor, "N 5"]) -> TexelGrid:
-        """A grid for ``bilinear`` of N samples that lie in a head each, given the ``sizes`` of those."""
-        height, width, down, across, first_tile = cast(Any, sizes.unbind(-1))
-        return replace(self, height=height, width=width, down=down, across=across, first_tile=first_tile)
 
     def bilinear(
         self, plane: Int[Tensor, "N"], uv: Float[Tensor, "N 2"]

@@ -6,7 +6,7 @@ A table has millions of rows of which a step reads a few: backward and optimiser
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -103,8 +103,12 @@ def texel_rows(
         planes: plane of each sample.
         ndc: position of each sample in its MPI.
     """
-    sizes = layout.once("sizes", lambda it: torch.tensor([g.sizes for g in it.grids], device=heads.device))
-    return layout.grids[0].with_sizes(sizes[heads]).bilinear(planes, ndc)
+    names = ("height", "width", "down", "across", "first_tile")
+    sizes = layout.once(
+        "sizes", lambda it: torch.tensor([[getattr(g, name) for name in names] for g in it.grids], device=heads.device)
+    )
+    of_samples: dict[str, Any] = dict(zip(names, sizes[heads].unbind(-1), strict=True))
+    return replace(layout.grids[0], **of_samples).bilinear(planes, ndc)
 
 
 @operation()
