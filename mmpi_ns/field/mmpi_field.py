@@ -232,8 +232,8 @@ class MMPIField(TexelTables):
         """
         if not isinstance(self.networks, RayShader):
             colors, weights = self.get_outputs(rays, samples, lookup), composite.weights.detach()[..., None]
-            first = (weights * colors).sum(1)
-            return render_colors(composite, colors), RaySums(first, weights.sum(1), first, (weights * colors**2).sum(1))
+            rgb, first = render_colors(composite, colors), (weights * colors).sum(1)
+            return rgb, RaySums(first, weights.sum(1), first, (weights * colors**2).sum(1))
         if lookup is None:
             sums = gather_places(self.layout, self.features.data, samples.places, composite.weights)
         else:
