@@ -185,7 +185,11 @@ class MMPIField(TexelTables):
         return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read)
 
     def get_outputs(  # type: ignore[override]
-        self, rays: RayBundle, samples: MergedSamples, lookup: Lookup | None = None
+        self,
+        rays: RayBundle,
+        samples: MergedSamples,
+        lookup: Lookup | None = None,
+        chosen: Bool[Tensor, "R"] | None = None,
     ) -> Float[Tensor, "R S 3"]:
         """Colours of the valid samples by a network for each, black in empty slots.
 
@@ -193,6 +197,7 @@ class MMPIField(TexelTables):
             rays: of the samples.
             samples: of the rays.
             lookup: where they read the tables; None looks them up where gradients are asked for.
+            chosen: as for ``render_colors``.
         """
         directions, axes = rays.directions, self.layout.frames.axes
         assert isinstance(self.networks, ColorNetworks), "rays that are shaded once have no colours of samples"
@@ -203,15 +208,17 @@ class MMPIField(TexelTables):
         if lookup is None and not torch.is_grad_enabled():
             return shade(self.layout, self.features.data, networks, axes, directions, samples.places)
         lookup = lookup or self._lookup(rays, samples)
-        features = lookup.read(lookup.features)
-        colors = [
-            head_colors(networks, k, part, lookup.ndc[here], geometry.rotate(axes[k], directions), lookup.rays[here])
-            for k, here, part in lookup.by_head(features)
-        ]
         out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
-        if colors:
-            out = out.index_copy(0, lookup.index, torch.cat(colors))
-        return out.view(*lookup.shape, 3)
+        colors, slots = [out[:0]], [lookup.index[:0]]
+        for k, here, part in lookup.by_head(lookup.read(lookup.features)):
+            of_samples = (part, lookup.ndc[here], lookup.rays[here], lookup.index[here])
+            if chosen is not None and not chosen.is_cuda:  # a GPU would be waited for
+                kept = chosen[of_samples[2]].nonzero()[:, 0]
+                of_samples = tuple(x.index_select(0, kept) for x in of_samples)
+            values, ndc, numbers, index = of_samples
+            colors.append(head_colors(networks, k, values, ndc, geometry.rotate(axes[k], directions), numbers))
+            slots.append(index)
+        return out.index_copy(0, torch.cat(slots), torch.cat(colors)).view(*lookup.shape, 3)
 
     def render_colors(
         self,
@@ -231,7 +238,7 @@ class MMPIField(TexelTables):
             chosen: rays whose colours are needed; others may be left out to save time. None for all.
         """
         if not isinstance(self.networks, RayShader):
-            colors, weights = self.get_outputs(rays, samples, lookup), composite.weights.detach()[..., None]
+            colors, weights = self.get_outputs(rays, samples, lookup, chosen), composite.weights.detach()[..., None]
             rgb, first = render_colors(composite, colors), (weights * colors).sum(1)
             return rgb, RaySums(first, weights.sum(1), first, (weights * colors**2).sum(1))
         if lookup is None:
