@@ -64,7 +64,7 @@ def measure(solids: Solids, mpis: list[MPIPlan], blends: bool = False) -> dict[s
     exact = solids.color(origins + t[:, None] * directions)
     slots = (of_slots(found, name) for name in ("inverse_t", "valid"))
     depth = np.abs(median_inverse_distance(found.composite.weights, *slots)[:, 0].double().numpy() - 1 / t)
-    color = np.abs(found.colors.rgb.double().numpy() - exact).mean(-1)
+    color = np.abs(found.rgb.double().numpy() - exact).mean(-1)
     return {"depth_error": float(depth.mean()), "color_error": float(color.mean())}
 
 

@@ -57,13 +57,13 @@ def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
     actual = s.render()
     gradients = gradients_of(s.field, actual, by)
     with torch.no_grad():
-        shaded = s.render().colors.rgb
+        shaded = s.render().rgb
     wrong = sum(a != b for a, b in zip(samples_of(actual)[0], samples_of(expected)[0], strict=True))
     return [
         *marched(s, name, exact),
         Check(f"{name}: rays with wrong samples, of {len(by)}", wrong, 0),
-        Check(f"{name}: colours", _relative(actual.colors.rgb, expected.colors.rgb), 2e-4),
-        Check(f"{name}: colours without gradients", _relative(shaded, expected.colors.rgb), 2e-4),
+        Check(f"{name}: colours", _relative(actual.rgb, expected.rgb), 2e-4),
+        Check(f"{name}: colours without gradients", _relative(shaded, expected.rgb), 2e-4),
         *(Check(f"{name}: gradient of {kind}", _relative(gradients[kind], slopes[kind]), 1e-3) for kind in slopes),
     ]
 
@@ -80,7 +80,7 @@ def marched(s: Scene, name: str, exact: Scene) -> list[Check]:
     return [
         Check(f"{name}: optical depths by the march", _relative(depth, of_slots(expected, "tau").sum(-1)), 1e-4),
         Check(f"{name}: rays that keep other samples than they should", int(((kept < least) | (kept > most)).sum()), 0),
-        Check(f"{name}: mass of what is dropped", _relative(actual.report.dropped_mass[:, 0], lost), 1e-2),
+        Check(f"{name}: mass of what is dropped", _relative(actual.samples.dropped_mass[:, 0], lost), 1e-2),
     ]
 
 

@@ -18,12 +18,12 @@ from report import Report, Row, page, slug, table, title
 from torch import Tensor
 
 from mmpi_ns.bench.trainers import Steps
-from mmpi_ns.field.samples import Lookup, metadata_of
+from mmpi_ns.field.tables import Lookup
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.ops.interpolate import Table, index_rows, read_rows, sum_rows, weigh_rows
-from mmpi_ns.ops.march import merge
-from mmpi_ns.rendering.rendered import bounded
+from mmpi_ns.ops.march import MergedSamples, march, merge
+from mmpi_ns.rendering.rendered import bounded, rays_of
 from mmpi_ns.scripts.command import run
 
 COPIED = 1 << 26
@@ -119,21 +119,22 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
 
     def sample():
         forming = not model.progress.schedule.sharpened(model.progress.step)
-        return model.sampler(bundle, field=field, **model.config.sampling.bounds(field.plan, forming))
+        options = model.config.sampling.march(field.plan, forming, blends=False)
+        return march(field.layout, field.tables, rays_of(bundle), options)
 
-    samples, report = sample()
-    lookup = field._lookup(samples)
-    (num_rays, slots), live, kept = lookup.shape, float(report.live.sum()), float(len(lookup.index))
+    samples = sample()
+    lookup = field._lookup(bundle, samples)
+    (num_rays, slots), live, kept = lookup.shape, float(samples.live.sum()), float(len(lookup.index))
     channels, rows, taps = field.feature_channels, float(len(lookup.rows)), lookup.taps[0]
     counts = {"rays": num_rays, "live": live, "kept": kept, "rows": rows, "pixels": len(batch["image"])}
     kept_bytes = 2 * 4 + 3 * 4 + 3 * 4 + 1  # head and plane, position, distance and depths, whether valid
     ops = [
         Op("march: look up, merge, keep", sample, live * 4 * 4 + kept * kept_bytes),
-        _sort(report.live, slots),
+        _sort(samples.live, slots),
         _index(lookup.rows[taps.positions], len(field.density), rows),
     ]
     ops += _interpolation(field, lookup, channels)
-    ops += _shading(field, samples, lookup, report)
+    ops += _shading(field, bundle, samples, lookup)
     ops.append(_variation(field, lookup, rows * (1 + channels) * 2 * 4))
     ops.append(_adam(steps, rows * (1 + channels) * 7 * 4))
     return ops, counts
@@ -164,19 +165,18 @@ def _interpolation(field: Any, lookup: Lookup, channels: int) -> list[Op]:
     ]
 
 
-def _shading(field: Any, samples: Any, lookup: Lookup, report: Any) -> list[Op]:
+def _shading(field: Any, rays: Any, samples: MergedSamples, lookup: Lookup) -> list[Op]:
     """Weights of the samples, and what rays show by them: forwards, and back to texels and depths."""
-    meta = metadata_of(samples)
-    valid, skipped = meta["valid"][..., 0], meta["skipped_before"][..., 0]
-    tau, features = meta["tau"][..., 0].clone().requires_grad_(), lookup.features.detach().requires_grad_()
+    valid, skipped = samples.valid, (samples.skipped_before, samples.skipped_total)
+    tau, features = samples.tau.clone().requires_grad_(), lookup.features.detach().requires_grad_()
     lookup = replace(lookup, density=lookup.density.detach(), features=features)
-    fixed = composite_weights.reference(tau.detach(), valid, skipped, report.skipped_total)
+    fixed = composite_weights.reference(tau.detach(), valid, *skipped)
 
     def weigh() -> Tensor:
-        return composite_weights.reference(tau, valid, skipped, report.skipped_total).weights
+        return composite_weights.reference(tau, valid, *skipped).weights
 
     def show() -> Tensor:
-        return field.render_colors(samples, lookup, fixed).rgb
+        return field.render_colors(rays, samples, lookup, fixed)[0]
 
     def back(work: Callable[[], Tensor]) -> None:
         work().sum().backward()

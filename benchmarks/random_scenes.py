@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops.interpolate import Table
+from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.rendering.rendered import RenderedRays, render_rays
-from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 Array = NDArray[Any]
@@ -47,12 +46,12 @@ def render(
     field: MMPIField, rays: RayBundle, threshold: float = 0.0, blends: bool = False, **sampling: Any
 ) -> RenderedRays:
     """Rays without background; without gradients as images are rendered."""
-    return render_rays(MMPISampler(), rays, field, blends=blends, threshold=threshold, **sampling)
+    return render_rays(rays, field, MarchOptions(threshold, blends=blends), **sampling)
 
 
 def of_slots(rendered: RenderedRays, name: str) -> Tensor:
-    """Data of each sample, by its name in the metadata [R, S]."""
-    return metadata_of(rendered.samples)[name][..., 0]
+    """Data of each sample [R, S], by its name in ``MergedSamples``."""
+    return getattr(rendered.samples, name)
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ def dense_grad(table: Table) -> Tensor | None:
 def gradients_of(field: MMPIField, rendered: RenderedRays, by: Array) -> dict[str, Tensor]:
     """Derivatives of the sum of ``by`` [R, 3] times the rays' colours, by every table."""
     field.zero_grad()
-    rendered.colors.rgb.backward(torch.tensor(by).to(rendered.colors.rgb))
+    rendered.rgb.backward(torch.tensor(by).to(rendered.rgb))
     grads = {name: dense_grad(getattr(field, name)) for name in TABLES}
     return {n: g.cpu() for n, g in grads.items() if g is not None}
 

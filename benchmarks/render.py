@@ -160,7 +160,7 @@ def exact_colors(model: MMPIModel, images: list[Image], rays: list[Array]) -> Ar
         for part in (rays64[i : i + EXACT_RAYS] for i in range(0, len(rays64), EXACT_RAYS)):
             found = render_plainly(field, part, blends=model.blends(field))
             behind = found.composite.transmittance * BACKGROUNDS[model.config.rendering.background]
-            colors.append((found.colors.rgb + behind).clamp(0, 1).numpy())
+            colors.append((found.rgb + behind).clamp(0, 1).numpy())
     return np.concatenate(colors)
 
 

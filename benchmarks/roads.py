@@ -19,9 +19,10 @@ from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene, config_of, trainer_of
 from mmpi_ns.capture.datamanager import load_observations
+from mmpi_ns.ops.march import MarchOptions, march
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.metrics import ImageMetrics
-from mmpi_ns.rendering.rendered import bounded
+from mmpi_ns.rendering.rendered import bounded, rays_of
 from mmpi_ns.scene.windows import Window
 from mmpi_ns.scripts.command import run
 from mmpi_scene import catalogue
@@ -160,8 +161,9 @@ def _look(trainer: Any, window: int) -> dict[str, float]:
     rgb, truth = model.get_outputs_for_camera(camera)["rgb"], data_set.get_data(nearest)["image"][..., :3]
     rays = camera.generate_rays(0, keep_shape=False)
     some = bounded(rays[:: max(1, len(rays) // 4096)], model.field.plan)
-    samples, report = model.sampler(some, field=model.field, threshold=model.config.rendering.threshold)
-    kept, live = float(samples.metadata["valid"].sum() / len(some)), float(report.live.float().mean())
+    field, options = model.field, MarchOptions(model.config.rendering.threshold)
+    samples = march(field.layout, field.tables, rays_of(some), options)
+    kept, live = float(samples.valid.sum() / len(some)), float(samples.live.float().mean())
     psnr = ImageMetrics("none")(rgb, truth)["psnr"]
     return {"frame_ms": frame_ms, "psnr_db": psnr, "live_samples": live, "kept_samples": kept}
 

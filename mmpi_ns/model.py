@@ -22,7 +22,6 @@ from torch.nn import Parameter
 from mmpi_ns.capture.datamanager import DEPTHS_KNOWN, GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
-from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.layout import Shapes
 from mmpi_ns.ops.march import MarchOptions
@@ -36,15 +35,15 @@ from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_wi
 from mmpi_ns.rendering.metrics import ImageMetrics, image_scores, pictures
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
-    RenderedRays,
     RenderingConfig,
     background_of,
     bounded,
+    rays_of,
     render_rays,
     shown_outputs,
     winners,
 )
-from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig, rays_of
+from mmpi_ns.rendering.sampler import SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -127,11 +126,10 @@ class MMPIModel(Model):
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
         self.exposures = Exposures(metadata.get(GAINS), None if views is None else views.origins)
-        self.sampler = MMPISampler()
         self.details: Details | None = None
         self.metrics = ImageMetrics(config.lpips_net)
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
-        """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
+        """In place of ``scores_and_images`` while the pipeline evaluates images, which are exact then."""
         self.show = ViewerDropdown("Show MPI", "all", ["all"], hint="One MPI alone, or all")
         self._take_plan()
         dispatch.choose(config.ops)
@@ -228,8 +226,8 @@ class MMPIModel(Model):
                 head_mask[:, num_mpis:].fill_(True)
                 bundle = bundle.broadcast_to((num_mpis, asked)).flatten()
         blends = "reliability" in TRAINS[progress.phase.name] and self.blends(field)
-        bounds = self.config.sampling.bounds(field.plan, forming=not progress.schedule.sharpened(progress.step))
-        rays = render_rays(self.sampler, bundle, field, blends=blends, head_mask=head_mask, choose=choose, **bounds)
+        options = self.config.sampling.march(field.plan, not progress.schedule.sharpened(progress.step), blends)
+        rays = render_rays(bundle, field, options, head_mask, choose)
         return {"training": replace(rays, times=len(bundle) // asked)}
 
     def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:
@@ -269,7 +267,7 @@ class MMPIModel(Model):
         mode, first_head = self.config.rendering.mode, sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
-        may_bake = mode == "auto" and not self.trains and one_exposure
+        may_bake = mode == "auto" and not self.trains and one_exposure and self.scoring is None
         bundle = bounded(bundle, field.plan)
         if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
             rays = rays_of(bundle)
@@ -366,7 +364,7 @@ class MMPIModel(Model):
         weight = replace(weight, known_depth=weight.known_depth * self.progress.schedule.decay(step))
         total, errors = batch_losses(rays, self.field, image, weight, g, step)
         if rays.lookup is not None and self.progress.schedule.watches(step):
-            self.field.note_use(rays.lookup, rays.composite.weights, rays.report.live, errors)
+            self.field.note_use(rays.lookup, rays.composite.weights, rays.samples.live, errors)
         self.camera_optimizer.get_loss_dict(total)
         # A batch of rays that meet nothing trainable would have no gradient; this adds 0 with a gradient.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()
@@ -375,9 +373,9 @@ class MMPIModel(Model):
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Any]:
         if "training" not in outputs:
             return {"psnr": -10 * torch.log10(photometric(outputs["rgb"], self.observed(batch)))}
-        rays: RenderedRays = outputs["training"]
-        kept, live = metadata_of(rays.samples)["valid"].float().sum() / len(rays.report.live), rays.report.live.float()
-        counts = {"live_samples": live.mean(), "kept_samples": kept, "dropped_mass": rays.report.dropped_mass.mean()}
+        samples = outputs["training"].samples
+        live, kept = samples.live.float().mean(), samples.valid.float().sum() / len(samples.live)
+        counts = {"live_samples": live, "kept_samples": kept, "dropped_mass": samples.dropped_mass.mean()}
         self.camera_optimizer.get_metrics_dict(counts)
         return counts
 

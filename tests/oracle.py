@@ -267,7 +267,7 @@ def render_ray(samples_by_head, blends=True):
 
 
 def sample_mpi(head, mpis, origin, direction, near, far, tau_of, color_of, reliability_of):
-    """RaySamples of one MPI: its live planes, with what the callables answer.
+    """Samples of one MPI: its live planes, with what the callables answer.
 
     Args:
         head: index of the MPI in ``mpis``.

@@ -12,12 +12,12 @@ import pytest
 import torch
 from hand_made import random_mpi, unit
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.field_components.field_heads import FieldHeadNames
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights, render_colors
-from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.ops.march import MarchOptions, march
+from mmpi_ns.rendering.rendered import rays_of
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 
@@ -67,26 +67,26 @@ def bundle(origins, directions, near=0.05, far=math.inf):
 @dataclass(frozen=True)
 class Rendered:
     samples: object
-    report: object
     composite: object
     rgb: torch.Tensor
 
 
+def sampled(field, rays, threshold=0.0, blends=False, fair_share=math.inf, head_mask=None, choose=None):
+    """The rays, and what the march keeps of them: arguments of the field."""
+    options = MarchOptions(threshold, fair_share, blends)
+    return rays, march(field.layout, field.tables, rays_of(rays, head_mask, choose), options)
+
+
 @torch.no_grad()
 def render(field, rays, threshold=0.0, blends=False, **chosen):
-    """Sampler, field and compositing, put together as the model does."""
-    samples, report = MMPISampler()(rays, field=field, threshold=threshold, blends=blends, **chosen)
-    tau, lookup = field.get_density(samples)
-    tau = tau[..., 0]
+    """March, field and compositing, put together as the model does."""
+    _, samples = sampled(field, rays, threshold, blends, **chosen)
+    tau, lookup = field.get_density(rays, samples)
     if blends and lookup.index.numel():
-        flat = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(samples, lookup))
+        flat = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(rays, samples, lookup))
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
-    meta = samples.metadata
-    composite = composite_weights.reference(
-        tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total
-    )  # fmt: skip
-    colors = field.get_outputs(samples, lookup)[FieldHeadNames.RGB]
-    return Rendered(samples, report, composite, render_colors(composite, colors))
+    composite = composite_weights.reference(tau, samples.valid, samples.skipped_before, samples.skipped_total)
+    return Rendered(samples, composite, render_colors(composite, field.get_outputs(rays, samples, lookup)))
 
 
 # The same by loops in float64 -----------------------------------------------------------------------------------------
@@ -214,12 +214,12 @@ def compare(field, origins, directions, blends=False, heads_of=None, near=0.05, 
             continue
         wanted = ray.render(blends, heads_of(i, ray) if heads_of else None)
         count = len(wanted.samples)
-        assert found.report.live[i] == count
-        valid = found.samples.metadata["valid"][i, :, 0]
+        assert found.samples.live[i] == count
+        valid = found.samples.valid[i]
         assert valid.sum() == count and valid[:count].all()
-        assert found.samples.metadata["heads"][i, :count, 0].tolist() == [s.head for s in wanted.samples]
-        assert found.samples.metadata["planes"][i, :count, 0].tolist() == [s.plane for s in wanted.samples]
-        inverse_t = found.samples.metadata["inverse_t"][i, :count, 0].tolist()
+        assert found.samples.heads[i, :count].tolist() == [s.head for s in wanted.samples]
+        assert found.samples.planes[i, :count].tolist() == [s.plane for s in wanted.samples]
+        inverse_t = found.samples.inverse_t[i, :count].tolist()
         assert inverse_t == pytest.approx([s.inverse_t for s in wanted.samples], rel=1e-4, abs=1e-6)
         assert np.abs(found.composite.weights[i, :count].numpy() - wanted.weights).max(initial=0) < error
         assert np.abs(found.rgb[i].numpy() - wanted.color).max() < error

@@ -179,8 +179,8 @@ SHARED = {80: 164, 86: 100, 89: 100, 90: 228}
 REGISTERS = 65536
 BANDWIDTH = {80: 2039e9, 86: 936e9, 89: 1008e9, 90: 3350e9}
 """Bytes a second of an A100 80 GB, RTX 3090, RTX 4090 and H100 SXM (their makers' figures)."""
-PLANS = {n: Shapes((n,), cube=False, blends=False, most_samples=300) for n in (4, 9, 64)}
-"""Not blended, eight channels, up to 320 samples a ray: by the number of MPIs."""
+PLANS = {n: Shapes((n,), cube=False, blends=False) for n in (4, 9, 64)}
+"""Not blended, eight channels: by the number of MPIs."""
 
 
 def launches_of_plans(setattr):
@@ -241,7 +241,7 @@ def page(content):
         "From their compiled form, without a device: `PYTHONPATH=.:tests python tests/triton_compiling.py "
         f"{' '.join(n.removeprefix('sm_') for n in names)} --write docs/results/kernels.json` (Triton "
         f"{content['made']['triton']}, the launch of each kernel with the most in it, not blended, eight channels; the "
-        "march and pictures of 6 planes an MPI, compositing of rays of 320 samples).", "",
+        "march and pictures of 6 planes an MPI).", "",
         "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
         "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "
         "read or written once; what kernels look up in tables comes on top. The roof is the memory's bandwidth over "

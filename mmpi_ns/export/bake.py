@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -24,7 +24,7 @@ from mmpi_ns.export.details import stored_view
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.rendering.baked import BakedWindow
-from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.rendering.metrics import ImageMetrics, psnr
 from mmpi_ns.scene.baked import Codes, most_of_copies, neighbours
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
@@ -140,49 +140,29 @@ def poses_of(pipeline: Any) -> list[Pose]:
     return [poses[name] for name in sorted(poses)]
 
 
-@dataclass(frozen=True)
-class Compared:
-    """Baked and exact images compared: means over test images."""
-
-    to_exact: float
-    """PSNR of baked images against the exact renderer's, dB."""
-    exact: dict[str, float]
-    """psnr and ssim of the exact renderer against the ground truth, and seconds of processor time for a frame."""
-    baked: dict[str, float]
-    """The same for baked images."""
-
-    def __str__(self) -> str:
-        words = [f"{m['psnr']:.2f} dB, SSIM {m['ssim']:.4f}, {m['seconds']:.3f} s" for m in (self.exact, self.baked)]
-        return (
-            f"Baked images have {self.to_exact:.1f} dB to the exact renderer's;\n"
-            f"  against the truth {words[1]} a frame (processor time),\n  exact {words[0]}."
-        )
-
-
 @torch.no_grad()
-def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
-    """Compares baked test images with exact ones and the ground truth.
+def compare(pipeline: Any, scene: BakedScene, count: int) -> dict[str, dict[str, float]]:
+    """Baked test images beside exact ones: means over the images.
 
     Args:
         pipeline: of the run.
         scene: its baked scene.
         count: number of test images, evenly spaced; all if there are fewer.
+
+    Returns:
+        Of the renderers "exact" and "baked" psnr and ssim against the ground truth, seconds of processor time for a
+        frame, and "to_exact", the PSNR of its images against those of the exact one, dB.
     """
     dataset, metrics = pipeline.datamanager.eval_dataset, ImageMetrics("none")
-    to_exact: list[float] = []
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}
     for i in torch.linspace(0, len(dataset) - 1, min(count, len(dataset))).long().tolist():
         bundle, truth = image_rays(dataset.cameras[i : i + 1]), dataset[i]["image"][..., :3]
-        renderers = {
-            "exact": lambda bundle=bundle: pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"],
-            "baked": lambda bundle=bundle: scene.image(bundle)["rgb"],
-        }
-        images = {}
-        for name, render in renderers.items():
+        exact = None
+        for name, image_of in (("exact", pipeline.model.get_outputs_for_camera_ray_bundle), ("baked", scene.image)):
             start = time.process_time()
-            images[name] = render().cpu()
+            image = image_of(bundle)["rgb"].cpu()
             seconds = time.process_time() - start
-            rows[name].append({"ssim": math.nan, "seconds": seconds} | metrics(images[name], truth))
-        to_exact.append(metrics(images["baked"], images["exact"])["psnr"])
-    means = {name: {key: fmean(r[key] for r in each) for key in each[0]} for name, each in rows.items()}
-    return Compared(fmean(to_exact), **means)
+            exact = image if exact is None else exact
+            row = {"ssim": math.nan, "seconds": seconds, "to_exact": psnr(image, exact)}
+            rows[name].append(row | metrics(image, truth))
+    return {name: {key: fmean(r[key] for r in each) for key in each[0]} for name, each in rows.items()}

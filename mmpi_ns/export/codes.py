@@ -1,7 +1,7 @@
 """The stored form of codes of bricks: differences from the codes around them, which gzip makes small (docs/export.md).
 
 Of the codes of a channel, every second row and column of a brick is stored apart from the others: a page that has these
-shows a brick at half of its resolution, and nothing is stored twice.
+shows a brick at half of its resolution, and nothing is stored twice. ``ops/baked/reader.py`` joins them again.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -73,25 +73,6 @@ def coarse_differences(coarse: NDArray[np.uint8]) -> NDArray[np.uint8]:
     stored = np.diff(np.diff(coarse, axis=3, prepend=np.uint8(0)), axis=2, prepend=np.uint8(0))
     stored[:, :, 0, 0] = np.diff(stored[:, :, 0, 0], prepend=np.uint8(0))
     return stored.reshape(*coarse.shape[:2], (SIDE // 2) ** 2).swapaxes(1, 2)
-
-
-def joined_codes(
-    parts: tuple[NDArray[np.uint8], ...], is_early: Bool[Tensor, "B"], beside: Int[Tensor, "2 B"]
-) -> UInt8[Tensor, "B 8 8"]:
-    """The codes of a channel from its stored parts (``split_codes``, ``coarse_differences``): coarse codes of the early
-    bricks, those of the others, and fine ones."""
-    early, late, fine = parts
-    codes = np.empty((fine.shape[1], SIDE, SIDE), np.uint8)
-    for stored, bricks in ((early, is_early.numpy()), (late, ~is_early.numpy())):
-        coarse = stored.T.reshape(-1, SIDE // 2, SIDE // 2).copy()
-        coarse[:, 0, 0] = np.cumsum(coarse[:, 0, 0], dtype=np.uint8)
-        codes[bricks, ::2, ::2] = coarse.cumsum(1, dtype=np.uint8).cumsum(2, dtype=np.uint8)
-    codes[:, ~COARSE] = fine.T
-    codes[:, ::2, 1::2] += _means(codes[:, ::2, ::2], 2)
-    codes[:, 1::2] += _means(codes[:, ::2], 1)
-    joined = torch.from_numpy(codes)
-    take_borders(joined, beside)
-    return joined
 
 
 def _means(codes: NDArray[Any], axis: int) -> NDArray[Any]:

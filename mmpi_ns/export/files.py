@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.rays import CameraRays
-from mmpi_ns.export.codes import coarse_differences, joined_codes, split_codes
+from mmpi_ns.export.codes import coarse_differences, split_codes
 from mmpi_ns.export.details import STEP, StoredView, cameras_of, restored_view
+from mmpi_ns.ops.baked import reader
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.details import Details, DetailView
 from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks, render_windows
-from mmpi_ns.scene.baked import BakedMpis, Codes, Shader, bits_of, neighbours, numbered_columns
+from mmpi_ns.scene.baked import SIDE, BakedMpis, Codes, Shader, bits_of, neighbours
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.errors import InputError
@@ -307,22 +308,21 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, Baked
     nears = {"ray_near": row["ray_near"], "content_near": row["content_near"]}
     plan = ScenePlan.from_object({"mpis": mpi_rows, "cube": None, "origin_of_plan": "baked", **nears})
     radius = math.inf if row["radius"] is None else row["radius"]
-    return (Window(tuple(row["center"]), radius, row["margin"], plan), _window_of(row, plan, arrays)), views
+    return (Window(tuple(row["center"]), radius, row["margin"], plan), _window_of(row, plan.mpis, arrays)), views
 
 
-def _window_of(row: dict[str, Any], plan: ScenePlan, arrays: dict[str, NDArray[Any]]) -> BakedWindow:
+def _window_of(row: dict[str, Any], mpis: tuple[MPIPlan, ...], arrays: dict[str, NDArray[Any]]) -> BakedWindow:
     """A window from its part of the header and what ``_arrays`` gave."""
     masks, early_masks = (torch.from_numpy(arrays[name].view(np.int32)) for name in ("columns", "early_columns"))
-    columns, early = numbered_columns(masks), bits_of(early_masks)[bits_of(masks) > 0] > 0
-    beside = neighbours(columns, plan.mpis, len(early))
-    channels = zip(*(arrays[name] for name in ("early", "late", "fine")), strict=True)
-    density, *texels = (joined_codes(parts, early, beside) for parts in channels)
+    early = bits_of(early_masks)[bits_of(masks) > 0] > 0
+    decoded = row | {f"{name}_array": array for name, array in arrays.items()}
+    codes = torch.from_numpy(reader.decode(decoded)).view(-1, len(early), SIDE, SIDE)
     baked = BakedMpis(
-        plan.mpis,
+        mpis,
         tuple(m["interval"] for m in row["mpis"]),
-        columns,
-        density,
-        torch.stack(texels, -1),
+        torch.from_numpy(decoded["columns_array"].astype(np.int32)),
+        codes[0],
+        codes[1:].movedim(0, -1).contiguous(),
         Codes(**row["density"]),
         tuple(Codes(**c) for c in row["channels"]),
     )

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from mmpi_ns.export.files import Pose
 from mmpi_ns.ops.gather import COLORS, activate
-from mmpi_ns.ops.splat import BLUR, Gaussians, View, splat_image, splat_opacities, splat_sums
+from mmpi_ns.ops.splat import BLUR, Gaussians, View, splat_errors, splat_image
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.scene.baked import CELLS, SIDE, brick_numbers
 from mmpi_ns.utils.files import write_atomically
@@ -139,16 +139,16 @@ def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats
     gaussians, count = splats.gaussians, len(splats.means)
     squares, errors, opacities = torch.zeros(count, 4, 4), torch.zeros(count, 4, COLORS), torch.zeros(count, 2)
 
-    def errors_in(pose: Pose) -> tuple[View, Tensor, Tensor]:
+    def errors_in(pose: Pose) -> tuple[View, Tensor]:
         view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
         colors = splats.seen_from(view.to_world[:, 3])
         image = splat_image(gaussians, view, colors)
         shown = image[..., :3] + window.background * image[..., 3:]
         missing = window.render(*pose.rays())["rgb"].view(shown.shape) - shown
-        return view, splat_sums(gaussians, view, missing), splat_opacities(gaussians, view, colors, shown, missing)
+        return view, splat_errors(gaussians, view, colors, shown, missing)
 
-    for view, sums, change in in_order(errors_in, poses):
-        opacities += change
+    for view, sums in in_order(errors_in, poses):
+        opacities += sums[:, 4:]
         seen = sums[:, 3].nonzero()[:, 0]
         basis, sums = splats.basis(view.to_world[:, 3])[seen], sums[seen]
         squares.index_add_(0, seen, basis[:, :, None] * basis[:, None] * sums[:, 3, None, None])

@@ -6,25 +6,24 @@ Its tables are in ``tables.py``.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
-from nerfstudio.cameras.rays import RaySamples
-from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from mmpi_ns.field.samples import Lookup, head_spans, metadata_of, places_of
-from mmpi_ns.field.shading import ColorNetworks, RayColors, RayShader, Shading
-from mmpi_ns.field.tables import TexelTables
+from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
+from mmpi_ns.field.tables import Lookup, TexelTables
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
-from mmpi_ns.ops.gather import COLORS, Taps, gather_places, gather_taps
+from mmpi_ns.ops.gather import COLORS, RaySums, Taps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.shade import SampleNetworks, shade
+from mmpi_ns.ops.march import MergedSamples
+from mmpi_ns.ops.shade import head_colors, shade
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.geometry import FACING_EPS, LocalRays, sample_disparity
@@ -137,6 +136,12 @@ class MMPIField(TexelTables):
         """Factor on every optical depth of an MPI, from the current plan: that of a checkpoint has its own K."""
         return 1.0 / len(self.full_plan.mpis) if self.shares_depth else 1.0
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its tables, and of its bricks if it is baked."""
+        bricks = self.cached("baked")
+        return sum(x.nbytes for x in self.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
+
     def forget_baked(self) -> None:
         """Drops the baked window, because the field is about to be trained."""
         self._packed.pop(("baked", self.density.device), None)
@@ -144,36 +149,30 @@ class MMPIField(TexelTables):
     # nerfstudio's Field ------------------------------------------------------------------------------------------
 
     def get_density(  # type: ignore[override]
-        self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None
-    ) -> tuple[Float[Tensor, "R S 1"], Lookup]:
+        self, rays: RayBundle, samples: MergedSamples
+    ) -> tuple[Float[Tensor, "R S"], Lookup]:
         """Optical depth of each valid sample (0 in empty slots), and where the lookups went.
 
         nerfstudio's "density" times interval: on a plane there is no interval, so the product itself is learned.
-
-        Args:
-            ray_samples: merged samples.
-            head_counts: samples of each head, if known (``MergedSamples``).
         """
-        lookup = self._lookup(ray_samples, head_counts)
+        lookup = self._lookup(rays, samples)
         if self.training and self.learns_cover:
             self.touched.index_fill_(0, lookup.rows, 1)
             self.touched[:BRICK].zero_()
         raw = lookup.by_head(lookup.read(lookup.density)[:, 0])
-        tau = [self.layout.optical_depth(k, part, lookup.planes[samples]) for k, samples, part in raw]
+        tau = [self.layout.optical_depth(k, part, lookup.planes[here]) for k, here, part in raw]
         out = lookup.ndc.new_zeros(lookup.shape.numel())
         if tau:
             out = out.index_copy(0, lookup.index, torch.cat(tau))
-        return out.view(*lookup.shape, 1), lookup
+        return out.view(lookup.shape), lookup
 
-    def _lookup(self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None) -> Lookup:
-        meta = metadata_of(ray_samples)
-        index, heads, planes, ndc, counts = order_by_head(places_of(ray_samples), len(self.grids), head_counts)
-        starts, ways = ray_samples.frustums.origins[:, 0], ray_samples.frustums.directions[:, 0]
-        if starts.requires_grad or ways.requires_grad:
-            rays, inverse_t = index // meta["valid"].shape[1], meta["inverse_t"].reshape(-1)[index]
-            ndc = moving(self.layout, starts, ways, rays, heads, planes, inverse_t, ndc)
-        spans, num_mpis = head_spans(counts), len(self.plan.mpis)
-        in_mpis, parts = sum(counts[:num_mpis]), []
+    def _lookup(self, rays: RayBundle, samples: MergedSamples) -> Lookup:
+        index, heads, planes, ndc, counts = order_by_head(samples.places, len(self.grids), samples.head_counts)
+        if rays.origins.requires_grad or rays.directions.requires_grad:
+            of_rays, inverse_t = index // samples.valid.shape[1], samples.inverse_t.reshape(-1)[index]
+            ndc = moving(self.layout, rays.origins, rays.directions, of_rays, heads, planes, inverse_t, ndc)
+        spans = [(k, slice(end - n, end)) for k, (n, end) in enumerate(zip(counts, accumulate(counts))) if n]  # noqa: B905
+        in_mpis, parts = sum(counts[: len(self.plan.mpis)]), []
         if in_mpis:
             parts.append(texel_rows(self.layout, heads[:in_mpis], planes[:in_mpis], ndc[:in_mpis]))
         if in_mpis < len(index):
@@ -183,63 +182,73 @@ class MMPIField(TexelTables):
         positions = distinct.positions.split([len(r) for r in rows])
         taps = [Taps(p.view(w.shape), w) for p, (_, w) in zip(positions, parts)]  # noqa: B905
         read = (distinct.unique, *(read_rows(table, distinct.unique) for table in (self.density, self.features)))
-        return Lookup(meta["valid"].shape[:2], index, heads, planes, ndc, spans, taps, *read)
+        return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read)
 
     def get_outputs(  # type: ignore[override]
-        self, ray_samples: RaySamples, density_embedding: Lookup | None = None
-    ) -> dict[FieldHeadNames, Tensor]:
-        """Colours of the valid samples (diffuse ones where a ray is shaded once); empty slots are black."""
-        directions, axes, networks = ray_samples.frustums.directions[:, 0], self.layout.frames.axes, self.networks
-        numbers = self.planned_heads(torch.arange(self.plan.num_heads)).tolist()  # a copy has its MPI's network
+        self,
+        rays: RayBundle,
+        samples: MergedSamples,
+        lookup: Lookup | None = None,
+        chosen: Bool[Tensor, "R"] | None = None,
+    ) -> Float[Tensor, "R S 3"]:
+        """Colours of the valid samples by a network for each, black in empty slots.
+
+        Args:
+            rays: of the samples.
+            samples: of the rays.
+            lookup: where they read the tables; None looks them up where gradients are asked for.
+            chosen: as for ``render_colors``.
+        """
+        directions, axes = rays.directions, self.layout.frames.axes
+        assert isinstance(self.networks, ColorNetworks), "rays that are shaded once have no colours of samples"
+        # A copy has its MPI's network.
+        networks = self.networks.of_heads(self.planned_heads(torch.arange(self.plan.num_heads)).tolist())
         if self.layout.cube is not None:
             axes = torch.cat([axes, torch.eye(3, device=axes.device)[None]])
-        if isinstance(networks, ColorNetworks) and density_embedding is None and not torch.is_grad_enabled():
-            octaves = (networks.position_frequencies, networks.direction_frequencies)
-            of_heads = SampleNetworks(tuple(networks.layers(k) for k in numbers), *octaves)
-            samples = (directions, places_of(ray_samples))
-            return {FieldHeadNames.RGB: shade(self.layout, self.features.data, of_heads, axes, *samples)}
-        lookup = density_embedding or self._lookup(ray_samples)
-        features = lookup.read(lookup.features)
-        if isinstance(networks, ColorNetworks):
-            colors = [
-                networks(numbers[k], part, lookup.ndc[here], geometry.rotate(axes[k], directions), lookup.rays[here])
-                for k, here, part in lookup.by_head(features)
-            ]
-            colors = torch.cat(colors) if colors else features.new_zeros(0, 3)
-        else:
-            colors = features[:, :3].sigmoid()
-        out = lookup.ndc.new_zeros(lookup.shape.numel(), 3).index_copy(0, lookup.index, colors)
-        return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
+        if lookup is None and not torch.is_grad_enabled():
+            return shade(self.layout, self.features.data, networks, axes, directions, samples.places)
+        lookup = lookup or self._lookup(rays, samples)
+        out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
+        colors, slots = [out[:0]], [lookup.index[:0]]
+        for k, here, part in lookup.by_head(lookup.read(lookup.features)):
+            of_samples = (part, lookup.ndc[here], lookup.rays[here], lookup.index[here])
+            if chosen is not None and not chosen.is_cuda:  # a GPU would be waited for
+                kept = chosen[of_samples[2]].nonzero()[:, 0]
+                of_samples = tuple(x.index_select(0, kept) for x in of_samples)
+            values, ndc, numbers, index = of_samples
+            colors.append(head_colors(networks, k, values, ndc, geometry.rotate(axes[k], directions), numbers))
+            slots.append(index)
+        return out.index_copy(0, torch.cat(slots), torch.cat(colors)).view(*lookup.shape, 3)
 
     def render_colors(
         self,
-        ray_samples: RaySamples,
+        rays: RayBundle,
+        samples: MergedSamples,
         lookup: Lookup | None,
         composite: Composite,
         chosen: Bool[Tensor, "R"] | None = None,
-    ) -> RayColors:
-        """Colours of rays.
+    ) -> tuple[Float[Tensor, "R 3"], RaySums]:
+        """Colours of rays without a background, and sums over the colours along them.
 
         Args:
-            ray_samples: merged samples.
+            rays: of the samples.
+            samples: of the rays.
             lookup: where they read the tables; None without gradients.
             composite: weights of the samples.
             chosen: rays whose colours are needed; others may be left out to save time. None for all.
         """
         if not isinstance(self.networks, RayShader):
-            lookup = lookup if lookup is None or chosen is None else lookup.of_rays(chosen)
-            colors = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]
-            rgb, weights = render_colors(composite, colors), composite.weights.detach()[..., None]
-            return RayColors(rgb, weights.sum(1), (weights * colors).sum(1), (weights * colors**2).sum(1))
+            colors, weights = self.get_outputs(rays, samples, lookup, chosen), composite.weights.detach()[..., None]
+            rgb, first = render_colors(composite, colors), (weights * colors).sum(1)
+            return rgb, RaySums(first, weights.sum(1), first, (weights * colors**2).sum(1))
         if lookup is None:
-            sums = gather_places(self.layout, self.features.data, places_of(ray_samples), composite.weights)
+            sums = gather_places(self.layout, self.features.data, samples.places, composite.weights)
         else:
             if chosen is None:
                 chosen = torch.ones(lookup.shape[0], dtype=torch.bool, device=lookup.rows.device)
             sums = gather_taps(lookup.features, lookup.taps, lookup.index, composite.weights, chosen)
-        mass, directions = composite.weights.sum(-1, keepdim=True), ray_samples.frustums.directions[:, 0]
-        rgb = self.networks.shade(sums.gathered, mass, composite.accumulation, directions)
-        return RayColors(rgb, sums.mass, sums.first, sums.second)
+        mass = composite.weights.sum(-1, keepdim=True)
+        return self.networks.shade(sums.gathered, mass, composite.accumulation, rays.directions), sums
 
     def total_variation(
         self, lookup: Lookup, density_weight: float, feature_weight: float, chroma_times: float = 0.0
@@ -269,15 +278,12 @@ class MMPIField(TexelTables):
                 total = total + weight * total_variation(values, table.data, lookup.rows, self.layout, scales)
         return total
 
-    def sample_shares(self, ray_samples: RaySamples, lookup: Lookup) -> tuple[Tensor, Tensor]:
-        """log P and log(1 - P) of the valid samples of a merged batch, with gradients to the reliability."""
-        frustums = ray_samples.frustums
+    def sample_shares(self, rays: RayBundle, samples: MergedSamples, lookup: Lookup) -> tuple[Tensor, Tensor]:
+        """log P and log(1 - P) of the valid samples of rays, with gradients to the reliability."""
         # Shares do not move with poses.
-        origins, directions = frustums.origins[:, 0].detach(), frustums.directions[:, 0].detach()
-        local = geometry.LocalRays.of(origins, directions, self.layout.frames)
-        inverse_t = metadata_of(ray_samples)["inverse_t"].reshape(-1)[lookup.index]
-        samples = (lookup.rays, local, inverse_t, lookup.heads)
-        return log_shares(self.layout, self.reliability, self.touched, *samples)
+        local = geometry.LocalRays.of(rays.origins.detach(), rays.directions.detach(), self.layout.frames)
+        places = (lookup.rays, local, samples.inverse_t.reshape(-1)[lookup.index], lookup.heads)
+        return log_shares(self.layout, self.reliability, self.touched, *places)
 
 
 def with_chroma(gradient: Float[Tensor, "U C"], times: float) -> Float[Tensor, "U C"]:

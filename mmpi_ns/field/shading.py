@@ -7,16 +7,16 @@ network shades the ray once. ``sample``: a network gives every sample its colour
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from mmpi_ns.field.tables import replace_data
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.ops.shade import Layers, positional_encoding, run_layers, sample_colors
+from mmpi_ns.ops.shade import Layers, SampleNetworks, positional_encoding, run_layers
 
 Shading = Literal["ray", "sample"]
 """Whether the network is evaluated once a ray or for every sample."""
@@ -69,40 +69,11 @@ class ColorNetworks(Networks):
         super().__init__(count, inputs, width)
         self.position_frequencies, self.direction_frequencies = position_frequencies, direction_frequencies
 
-    def forward(
-        self,
-        head: int,
-        features: Float[Tensor, "N C"],
-        ndc: Float[Tensor, "N 3"],
-        directions: Float[Tensor, "R 3"],
-        rays: Int[Tensor, "N"] | None = None,
-    ) -> Float[Tensor, "N 3"]:
-        """Colours in [0, 1] of one head's samples.
-
-        Args:
-            head: of the network.
-            features: of each sample.
-            ndc: position of each sample.
-            directions: of each ray, in the head's axes; encoded once a ray.
-            rays: ray of each sample; None if there is one sample for each ray.
-        """
-        position = positional_encoding(ndc, self.position_frequencies)
-        direction = positional_encoding(directions, self.direction_frequencies)
-        direction = direction if rays is None else direction.index_select(0, rays)
-        return sample_colors(self.layers(head), features, position, direction)
-
-
-@dataclass(frozen=True)
-class RayColors:
-    """Colours of rays without a background, and of the samples along them."""
-
-    rgb: Float[Tensor, "R 3"]
-    mass: Float[Tensor, "R 1"]
-    """Sum of the weights of the samples below. No gradient reaches the weights from here on."""
-    first: Float[Tensor, "R 3"]
-    """Sum of weight times colour of each sample."""
-    second: Float[Tensor, "R 3"]
-    """Sum of weight times squared colour."""
+    def of_heads(self, numbers: Sequence[int]) -> SampleNetworks:
+        """Networks of heads, given the number of each head's network."""
+        return SampleNetworks(
+            tuple(self.layers(k) for k in numbers), self.position_frequencies, self.direction_frequencies
+        )
 
 
 class RayShader(Networks):

@@ -6,7 +6,8 @@ which nerfstudio fixes before K is known. Row arithmetic is in ``texels.py``, wo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,8 +15,8 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
-from mmpi_ns.field.samples import Lookup
-from mmpi_ns.ops.interpolate import Table
+from mmpi_ns.ops.gather import Taps
+from mmpi_ns.ops.interpolate import Table, weigh_rows
 from mmpi_ns.scene.bricks import grown_tiles, new_table, resample, take_bricks, tiles_with_copies
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
@@ -34,6 +35,46 @@ MIDDLE = 0.5
 """Share of stored texels in a texel between those and empty ones."""
 ENOUGH_CROSSINGS = 32
 """Average number of training samples for each brick before any brick may be released."""
+
+
+@dataclass(frozen=True)
+class Lookup:
+    """Lookups of the valid samples of a merged batch in the tables. Samples are ordered by head, then by slot.
+
+    Every row that the batch reads is taken from its table once: ``density`` and ``features`` are what the samples read,
+    and their gradients are those of the tables (``ops.interpolate.Table``).
+    """
+
+    shape: torch.Size
+    """(R, S) of the batch."""
+    index: Int[Tensor, "N"]
+    """Flat slots of the samples."""
+    heads: Int[Tensor, "N"]
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    spans: list[tuple[int, slice]]
+    """(head, its samples) for every head that occurs."""
+    taps: list[Taps]
+    """Of the samples of all MPIs together, then of those of the cube; positions are among ``rows``."""
+    rows: Int[Tensor, "U"]
+    """Distinct rows of the tables, rising."""
+    density: Float[Tensor, "U 1"]
+    features: Float[Tensor, "U C"]
+
+    @property
+    def rays(self) -> Int[Tensor, "N"]:
+        return self.index // self.shape[1]
+
+    def read(self, values: Float[Tensor, "U C"]) -> Float[Tensor, "N C"]:
+        """Interpolated values of the samples, from those of the rows."""
+        parts = [weigh_rows(values, taps.positions, taps.weights) for taps in self.taps]
+        return torch.cat(parts) if parts else values.new_zeros(0, values.shape[1])
+
+    def by_head(self, values: Float[Tensor, "N *C"]) -> Iterator[tuple[int, slice, Tensor]]:
+        """(head, its samples, their values) for every head that occurs."""
+        # Split, not sliced: the gradient of a slice is as large as the whole.
+        parts = values.split([samples.stop - samples.start for _, samples in self.spans])
+        return ((k, samples, part) for (k, samples), part in zip(self.spans, parts, strict=True))
 
 
 class TexelTables(Field):

@@ -105,7 +105,8 @@ def log_shares(
         is_own = heads == j
         votes = inside | is_own
         # Counting them would synchronise with a GPU: there all samples are looked up, the others in the empty brick.
-        index = torch.arange(len(heads), device=heads.device) if dispatch.on_device(heads) else votes.nonzero()[:, 0]
+        on_gpu = heads.device.type != "cpu" or dispatch.interpreting
+        index = torch.arange(len(heads), device=heads.device) if on_gpu else votes.nonzero()[:, 0]
         position, reads = ndc[index], votes[index]
         rows, weights = grid.trilinear(position)
         trained = reads & (touched[grid.nearest(position)] > 0)

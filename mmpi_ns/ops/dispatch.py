@@ -99,26 +99,33 @@ class Operation(Generic[P, R]):
 _OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 
-def operation(*compiled: Form, check: Callable[..., None] | None = None) -> Callable[[Callable[P, R]], Operation[P, R]]:
+def operation(
+    *compiled: Form, check: Callable[..., None] | None = None, in_cpp: int | None = None
+) -> Callable[[Callable[P, R]], Operation[P, R]]:
     """Makes an operation of a function.
 
     Args:
         compiled: the forms in modules beside it.
         check: takes the same arguments and raises what their annotations cannot say.
+        in_cpp: the form for a CPU is ``mmpi_NAME`` in C++ (``_in_cpp``); rows of its first result that are worth
+            another thread, 0: one thread computes all.
     """
-    return lambda reference: Operation(reference, compiled, check)
+
+    def make(reference: Callable[P, R]) -> Operation[P, R]:
+        of = Operation(reference, compiled, check)
+        if in_cpp is not None:
+            of.on_cpu(_in_cpp(of, in_cpp))
+        return of
+
+    return make
 
 
-def in_cpp(of: Operation[..., Any], least: int | None = None) -> None:
-    """Makes ``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ the form of an operation for a CPU.
+def _in_cpp(of: Operation[..., Any], least: int) -> Any:
+    """``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ as a form of an operation.
 
     Arguments are those of the definition, a named tuple's fields one by one; sizes what the letters in their
     annotations stand for, in the order in which they occur; results the tensor, or those of the named tuple, that it
     returns. Tensors of another type than annotated (int64 and float32, unless it names one) take the definition.
-
-    Args:
-        of: the operation.
-        least: rows of the first result that are worth another thread; None: one thread computes all.
     """
     hints, forms = get_type_hints(of.reference), annotated(of.reference)
 
@@ -140,11 +147,11 @@ def in_cpp(of: Operation[..., Any], least: int | None = None) -> None:
                 passed.append(tensor.contiguous())
         columns = [forms["return"]] if "return" in forms else annotated(hints["return"]).values()
         results = [torch.empty([sizes.get(n, n) for n in shape], dtype=kind) for shape, kind in columns]
-        parts = [0, len(results[0])] if least is None else len(results[0])
-        build.call_in_parts(f"mmpi_{of.name}", parts, *passed, *sizes.values(), *results, least=least or 1)
+        parts = len(results[0]) if least else [0, len(results[0])]
+        build.call_in_parts(f"mmpi_{of.name}", parts, *passed, *sizes.values(), *results, least=least)
         return results[0] if "return" in forms else hints["return"](*results)
 
-    of.on_cpu(form)
+    return form
 
 
 @functools.cache
@@ -174,11 +181,6 @@ def form_of(name: str, *tensors: Tensor) -> Form:
     if devices == ({"cpu"} if interpreting else {"cuda"}) and "gpu" in compiled and fault(name) is None:
         return "gpu"
     return "reference"
-
-
-def on_device(tensor: Tensor) -> bool:
-    """Whether reading a tensor synchronises: it is on a GPU, or treated as if it were (``interpreting``)."""
-    return tensor.device.type != "cpu" or interpreting
 
 
 @functools.cache

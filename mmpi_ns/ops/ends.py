@@ -9,14 +9,12 @@ TEXT = (Path(__file__).parent / "cpp" / "ends.h").read_text(encoding="utf-8")
 """Lines that both C++ and GLSL understand."""
 
 
-def numbers_in(text: str) -> dict[str, float]:
-    """Numbers of such a header by their names."""
-    return {name: float(number) for name, number in re.findall(r"^const float (\w+) = ([-.\de]+);", text, re.MULTILINE)}
+def numbers_in(text: str, *names: str) -> list[float]:
+    """Numbers of such a header."""
+    numbers = dict(re.findall(r"^const float (\w+) = ([-.\de]+);", text, re.MULTILINE))
+    return [float(numbers[name]) for name in names]
 
 
-_NUMBERS = numbers_in(TEXT)
-OPAQUE = _NUMBERS["OPAQUE"]
-OPAQUE_BAKED = _NUMBERS["OPAQUE_BAKED"]
-NEGLIGIBLE = _NUMBERS["NEGLIGIBLE"]
-NEAREST_ZERO = _NUMBERS["NEAREST_ZERO"]
-HALF = _NUMBERS["HALF"]
+OPAQUE, OPAQUE_BAKED, NEGLIGIBLE, NEAREST_ZERO, HALF = numbers_in(
+    TEXT, "OPAQUE", "OPAQUE_BAKED", "NEGLIGIBLE", "NEAREST_ZERO", "HALF"
+)

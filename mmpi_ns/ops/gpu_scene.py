@@ -135,18 +135,6 @@ def nearest(coordinate, size):
     return (down + up).to(tl.int64)
 
 
-@triton.jit
-def read_taps(values, positions, shares, number, inside, channels, column, TAPS: tl.constexpr):
-    """Sums over taps of share times row of a table."""
-    raw = number[:, None] * column * 0.0
-    for tap in tl.static_range(TAPS):
-        row = tl.load(positions + number * TAPS + tap, inside, 0).to(tl.int64)
-        share = tl.load(shares + number * TAPS + tap, inside, 0.0)
-        read = tl.load(values + row[:, None] * channels + column, inside[:, None] & (column < channels), 0.0)
-        raw += share[:, None] * read
-    return raw
-
-
 # Arithmetic that avoids cancellation ---------------------------------------------------------
 
 

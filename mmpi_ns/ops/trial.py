@@ -1,6 +1,6 @@
 """Tries an operation's GPU form on toy scenes: on the current device it must agree with the reference.
 
-The scenes have the shapes that kernels are compiled for in the run at hand: heads, channels, samples of a ray. So an
+The scenes have the shapes that kernels are compiled for in the run at hand: numbers of MPIs, channels. So an
 incompatible Triton release, driver or architecture is noticed here and not in the first step of a training, or never.
 """
 
@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from mmpi_ns.ops import build, dispatch
-from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.layout import SMALL, SceneLayout, Shapes, Tables
 from mmpi_ns.ops.march import MarchOptions, Rays
@@ -79,7 +78,7 @@ def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:
     leaves += [t.weights for t in taps if t.weights.requires_grad]
     with torch.set_grad_enabled(bool(leaves)):
         results = dispatch.function(name, form)(*copies)
-    numbers = _numbers(copies if results is None else results)
+    numbers = _numbers(results)
     if leaves:
         loss = sum((x * torch.linspace(-1, 1, x.numel(), device=x.device).view(x.shape)).sum() for x in numbers)
         numbers += list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
@@ -143,24 +142,6 @@ def _marches(device: str, shapes: Shapes, many: bool | None = None) -> list[tupl
     return cases
 
 
-def _entries(device: str, *shape: int) -> Tensor:
-    """Rows of a table of ``ROWS``, many of them several times."""
-    return (_random(device, *shape) * (ROWS // 3)).long() * 3
-
-
-def _composites(device: str, shapes: Shapes) -> list[tuple]:
-    """Rays of every width, at whose ends some light is left, thin samples and opaque ones among theirs."""
-    return [
-        (
-            (_random(device, RAYS, slots) ** 3 * min(1.0, 20 / slots)).requires_grad_(),
-            torch.arange(slots, device=device) < _entries(device, RAYS, 1) * slots // 20,
-            0.01 * _random(device, RAYS, slots),
-            _random(device, RAYS, 1),
-        )
-        for slots in shapes.widths
-    ]
-
-
 def _variations(device: str, shapes: Shapes) -> list[tuple]:
     cases = []
     for mpis in shapes.mpis:
@@ -173,15 +154,6 @@ def _variations(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
-def _adams(device: str, shapes: Shapes) -> list[tuple]:
-    cases, rows = [], 3 * torch.arange(ROWS // 3, device=device)
-    for channels in (1, shapes.channels):
-        moments, grad = _random(device, ROWS, 2, channels), _random(device, ROWS // 3, channels) - 0.5
-        step = (rows, grad * (grad.abs() > 0.1), AdamConstants(0.9, 0.99, 0.2, 1e-8, 0.1))
-        cases += [(_random(device, ROWS, channels), m, *step) for m in (moments, moments.bfloat16())]
-    return cases
-
-
 def _gathers(device: str, shapes: Shapes) -> list[tuple]:
     """Samples with known texels, of planes and of both planes and the cube, that move and that do not; texels with
     gradients and without."""
@@ -189,7 +161,8 @@ def _gathers(device: str, shapes: Shapes) -> list[tuple]:
     cases, both = [], (4, 8)
     for sizes, learns, moves in (((4,), True, False), (both, False, False), (both, True, False), (both, True, True)):
         shares = [(_random(device, RAYS, n) / n).requires_grad_(moves) for n in sizes]
-        taps = [Taps(_entries(device, RAYS, x.shape[1]).int(), x) for x in shares]
+        # Some rows of the table, many of them several times.
+        taps = [Taps((_random(device, *x.shape) * (ROWS // 3)).int() * 3, x) for x in shares]
         slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(len(sizes))])
         values = (2 * _random(device, ROWS, shapes.channels) - 1).requires_grad_(learns)
         cases.append((values, taps, slots, weights.clone().requires_grad_(), chosen))
@@ -205,24 +178,7 @@ def _pictures(device: str, shapes: Shapes, many: bool | None = None) -> list[tup
 
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "march": _marches,
-    "texel_rows": lambda device, shapes: [
-        (_scene(device, shapes.cube)[0], heads, heads + 2, 2 * _random(device, RAYS, 3) - 1)
-        for heads in [torch.arange(RAYS, device=device) * 2 // RAYS]
-    ],
-    "weighted_rows": lambda device, shapes: [
-        (_random(device, ROWS, channels), _entries(device, RAYS, taps), _random(device, RAYS, taps))
-        for taps in (4, 8)
-        for channels in (1, shapes.channels)
-    ],
-    "index_rows": lambda device, _: [(_entries(device, RAYS, 4), ROWS, False)],
-    "sum_rows": lambda device, shapes: [
-        (_entries(device, RAYS, taps).int(), _random(device, RAYS, channels), _random(device, RAYS, taps), ROWS)
-        for taps in (4, 8)
-        for channels in (1, shapes.channels)
-    ],
-    "composite_weights": _composites,
     "total_variation": _variations,
-    "adam_rows": _adams,
     "gather_taps": _gathers,
     "show_rays": _pictures,
 }

@@ -6,9 +6,7 @@ resulting share depends on the position alone, so a baked texel stores the optic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -50,24 +48,11 @@ AT_ONCE_BRICKS = 2**13
 AT_ONCE = 2**18
 """Rays whose weights are looked at together: all of a photo of 12 megapixels would take gigabytes."""
 
-_measuring: ContextVar[bool] = ContextVar("measuring", default=False)
-
-
-@contextmanager
-def exact_images() -> Iterator[None]:
-    """Inside, ``render auto`` uses the exact renderer for images of this thread."""
-    token = _measuring.set(True)
-    try:
-        yield
-    finally:
-        _measuring.reset(token)
-
 
 def suits_bricks(model_field: MMPIField) -> bool:
-    """Decision of ``render auto`` for a field that is not training: bricks if compiled, on a CPU, not for metrics."""
-    if _measuring.get() or torch.is_grad_enabled() or why_not_baked(model_field):
-        return False
-    return dispatch.form_of("show_baked", model_field.features.data) == "cpu"
+    """Decision of ``render auto`` for a field that is neither trained nor scored: bricks if compiled, on a CPU."""
+    compiled = dispatch.form_of("show_baked", model_field.features.data) == "cpu"
+    return compiled and not torch.is_grad_enabled() and not why_not_baked(model_field)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,45 +240,23 @@ def _raw(
 
 @torch.no_grad()
 def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
-    """Shares P of all rows of a field's tables, among the heads that cover the position of the texel; 1 elsewhere."""
-    shares = torch.ones_like(field.density)
+    """Shares P of the rows of a field of MPIs, among those that cover the position of the texel; 1 elsewhere."""
+    shares, frames = torch.ones_like(field.density), field.layout.frames
     rows = torch.arange(BRICK, len(shares), device=shares.device)
-    for k, grid in enumerate(field.grids):
+    for k, (grid, mpi) in enumerate(zip(field.grids, field.plan.mpis, strict=True)):
         stored = rows[grid.holds(rows)]
-        z, y, x = grid.texel(stored)
-        exists = (y < grid.height) & (x < grid.width)  # tiles extend beyond the borders of a plane
-        sizes = torch.tensor([grid.width, grid.height, grid.depth], device=stored.device)
-        ndc = (2 * torch.stack([x, y, z], -1)[exists] / (sizes - 1) - 1).to(shares.dtype)
-        for part, places in zip(stored[exists].split(AT_ONCE), ndc.split(AT_ONCE), strict=True):
-            origins, directions, inverse_t = rays_to(field, k, places)
-            local = geometry.LocalRays.of(origins, directions, field.layout.frames)
+        _, y, x = grid.texel(stored)
+        stored = stored[(y < grid.height) & (x < grid.width)]  # tiles extend beyond the borders of a plane
+        for part in stored.split(AT_ONCE):
+            plane, y, x = (i.to(shares.dtype) for i in grid.texel(part))
+            u0, u1, v0, v1 = mpi.extent
+            tangents = u0 + x / (grid.width - 1) * (u1 - u0), v0 + y / (grid.height - 1) * (v1 - v0)
+            # Rays from the MPI's own origin, to keep precision far from the world's.
+            directions = geometry.rotate(frames.axes[k].T, torch.stack([*tangents, torch.ones_like(x)], -1))
+            disparity = (mpi.planes - 1 - plane) * mpi.disparity_step + mpi.last_disparity
+            local = geometry.LocalRays.of(frames.origins[k].expand_as(directions), directions, frames)
             numbers = torch.arange(len(part), device=part.device)
-            samples = (numbers, local, inverse_t, torch.full_like(numbers, k))
+            samples = (numbers, local, disparity, torch.full_like(numbers, k))
             log_share, _ = log_shares(field.layout, field.reliability, field.touched, *samples)
             shares[part, 0] = log_share.exp()
     return shares
-
-
-def rays_to(
-    field: MMPIField, k: int, ndc: Float[Tensor, "N 3"]
-) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Rays from a head's own origin to positions in it, to keep precision far from the world origin.
-
-    Args:
-        field: of the head.
-        k: its number.
-        ndc: positions in it.
-
-    Returns:
-        Origins, directions (not of unit length), and inverse distances in units of those.
-    """
-    cube = field.layout.cube
-    if k == len(field.plan.mpis):
-        assert cube is not None
-        return cube.lower.expand_as(ndc), (ndc + 1) / 2 * (cube.upper - cube.lower), torch.ones_like(ndc[:, 0])
-    mpi, frames = field.plan.mpis[k], field.layout.frames
-    u0, u1, v0, v1 = mpi.extent
-    u, v = u0 + (ndc[:, 0] + 1) / 2 * (u1 - u0), v0 + (ndc[:, 1] + 1) / 2 * (v1 - v0)
-    disparity = (1 - ndc[:, 2]) / 2 / mpi.near * mpi.depth_share + mpi.last_disparity
-    directions = geometry.rotate(frames.axes[k].T, torch.stack([u, v, torch.ones_like(u)], -1))
-    return frames.origins[k].expand_as(ndc), directions, disparity

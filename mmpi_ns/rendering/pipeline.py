@@ -16,7 +16,6 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from torch import Tensor
 
 from mmpi_ns.capture.rays import image_rays
-from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.exposure import exposure_of_image
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.random_draws import generator
@@ -67,8 +66,7 @@ class MMPIPipeline(VanillaPipeline):
 
         model.scoring = score
         try:
-            with exact_images():
-                means = super().get_average_image_metrics(data_loader, image_prefix, *args, **kwargs)
+            means = super().get_average_image_metrics(data_loader, image_prefix, *args, **kwargs)
         finally:
             model.scoring = None
         # Of one image nerfstudio's deviations are NaN, which is no JSON.

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from nerfstudio.cameras.rays import RayBundle, RaySamples
+from jaxtyping import Bool, Float
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
 from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import Lookup, metadata_of
-from mmpi_ns.field.shading import RayColors, RayShader
+from mmpi_ns.field.shading import RayShader
+from mmpi_ns.field.tables import Lookup
 from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import Composite, composite_weights, median_inverse_distance, winning_heads
-from mmpi_ns.ops.march import MarchOptions, MergedSamples, show_rays
-from mmpi_ns.rendering.sampler import MMPISampler, rays_of
+from mmpi_ns.ops.gather import RaySums
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, march, show_rays
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
@@ -62,10 +63,12 @@ class RenderedRays:
     renders them)."""
 
     bundle: RayBundle
-    samples: RaySamples
+    samples: MergedSamples
     composite: Composite
-    colors: RayColors
-    report: MergedSamples
+    rgb: Float[Tensor, "R 3"]
+    """Without a background."""
+    sums: RaySums
+    """Of colours along the rays."""
     lookup: Lookup | None
     """Texels read from the field; None without gradients."""
     times: int = 1
@@ -78,6 +81,13 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     bundle.nears = near if bundle.nears is None else torch.maximum(bundle.nears, near)
     bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars
     return bundle
+
+
+def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:
+    """Rays for the march, and the heads that may render them (see ``ops.march.Rays``)."""
+    nears, fars = ray_bundle.nears, ray_bundle.fars
+    assert nears is not None and fars is not None
+    return Rays(ray_bundle.origins, ray_bundle.directions, nears, fars, head_mask, choose)
 
 
 def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, first_head: int) -> dict[str, Tensor]:
@@ -113,27 +123,38 @@ def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, fir
 
 
 def render_rays(
-    sampler: MMPISampler, bundle: RayBundle, field: MMPIField, *, blends: bool, **sampling: Any
+    bundle: RayBundle,
+    field: MMPIField,
+    options: MarchOptions,
+    head_mask: Bool[Tensor, "R H"] | None = None,
+    choose: Float[Tensor, "R K"] | None = None,
 ) -> RenderedRays:
-    """Renders rays that have nears and fars, with gradients if enabled. ``blends``: samples are blended by reliability;
-    ``sampling``: further arguments of the sampler."""
-    samples, report = sampler(bundle, field=field, blends=blends, **sampling)
-    meta, lookup = metadata_of(samples), None
-    tau = meta["tau"][..., 0]  # the sampler's own, without gradients
+    """Renders rays that have nears and fars, with gradients if enabled.
+
+    The march has none: the field differentiates through the samples that it keeps.
+
+    Args:
+        bundle: R rays.
+        field: to render.
+        options: which samples are kept, and how they are blended.
+        head_mask: heads that may render each ray; None for all.
+        choose: priorities; each ray is rendered by the MPI of highest priority among those it meets (and the cube).
+    """
+    with torch.no_grad():
+        samples = march(field.layout, field.tables, rays_of(bundle, head_mask, choose), options)
+    tau, lookup = samples.tau, None
     if torch.is_grad_enabled():
-        density, lookup = field.get_density(samples, report.head_counts)
-        tau = density[..., 0]
-        if blends and lookup.index.numel():
-            shares = field.sample_shares(samples, lookup)
+        tau, lookup = field.get_density(bundle, samples)
+        if options.blends and lookup.index.numel():
+            shares = field.sample_shares(bundle, samples, lookup)
             blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares)
             tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
-    valid, before = meta["valid"][..., 0], meta["skipped_before"][..., 0]
-    composite = composite_weights(tau, valid, before, report.skipped_total)
+    composite = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
     # Keypoint rays, whose points have a known depth and no pixel, are supervised in depth alone: no colours for them.
     keypoint_depths = None if lookup is None else bundle.metadata.get(KEYPOINT_DEPTH)
     chosen = None if keypoint_depths is None else keypoint_depths[:, 0] == 0
-    colors = field.render_colors(samples, lookup, composite, chosen)
-    return RenderedRays(bundle, samples, composite, colors, report, lookup)
+    rgb, sums = field.render_colors(bundle, samples, lookup, composite, chosen)
+    return RenderedRays(bundle, samples, composite, rgb, sums, lookup)
 
 
 def shown_outputs(
@@ -150,18 +171,18 @@ def shown_outputs(
         threshold: weight below which a sample is dropped.
         head_mask: heads that may render each ray; None for all.
     """
+    options = MarchOptions(threshold, blends=blends)
     if isinstance(field.networks, RayShader) and not torch.is_grad_enabled():
-        options, tables = MarchOptions(threshold, blends=blends), (field.tables, field.features.data)
-        shown = show_rays(field.layout, *tables, rays_of(bundle, head_mask), options)
+        rays = rays_of(bundle, head_mask)
+        shown = show_rays(field.layout, field.tables, field.features.data, rays, options)
         rgb = field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions)
         light, inverse_t, winner, dropped_mass = shown, shown.inverse_t, shown.winner, shown.dropped_mass
     else:
-        rays = render_rays(MMPISampler(), bundle, field, blends=blends, threshold=threshold, head_mask=head_mask)
-        rgb, light, meta = rays.colors.rgb, rays.composite, metadata_of(rays.samples)
-        with torch.no_grad():
-            inverse_t = median_inverse_distance(light.weights, meta["inverse_t"][..., 0], meta["valid"][..., 0])
-        winner = winning_heads(light.weights, meta["heads"][..., 0], field.plan.num_heads)
-        dropped_mass = rays.report.dropped_mass
+        rendered = render_rays(bundle, field, options, head_mask)
+        rgb, light, samples = rendered.rgb, rendered.composite, rendered.samples
+        inverse_t = median_inverse_distance(light.weights, samples.inverse_t, samples.valid)
+        winner = winning_heads(light.weights, samples.heads, field.plan.num_heads)
+        dropped_mass = samples.dropped_mass
     farthest = 10 * max(m.farthest for m in field.plan.mpis)  # stands for infinity
     return {
         "rgb": rgb,

@@ -94,12 +94,11 @@ class WindowStore:
             )
         try:
             state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
-            half = {name for name, values in state.items() if values.dtype == torch.float16}
-            needed = sum(values.nbytes * (2 if name in half else 1) for name, values in state.items())
-            while self._held and needed + sum(map(_bytes_of, self._held.values())) > self.budget:
+            needed = sum(x.nbytes * (2 if x.dtype == torch.float16 else 1) for x in state.values())
+            while self._held and needed + sum(held.nbytes for held in self._held.values()) > self.budget:
                 del self._held[next(iter(self._held))]  # the least recently used
             field = self.empty()
-            field.load_state_dict({name: x.float() if name in half else x for name, x in state.items()})
+            field.load_state_dict(state)
         except (*_DAMAGED, AttributeError) as error:
             raise InputError(
                 f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
@@ -142,9 +141,3 @@ class WindowStore:
                     f"Window {window} of the run to go on from is missing: {source} is not there. Put it back, or "
                     "resume from a checkpoint of before its end with --load-step."
                 )
-
-
-def _bytes_of(field: MMPIField) -> int:
-    """Bytes of its tables, and of its bricks if it is baked."""
-    bricks = field.cached("baked")
-    return sum(values.nbytes for values in field.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)

@@ -117,12 +117,6 @@ def bits_of(masks: Int[Tensor, "N"]) -> Int[Tensor, "N 32"]:
     return (masks[:, None] >> torch.arange(WORD)) & 1
 
 
-def numbered_columns(masks: Int[Tensor, "N"]) -> Int[Tensor, "N 2"]:
-    """Columns from their bits: bricks are numbered in the order of columns, and of planes in them."""
-    counts = bits_of(masks).sum(-1)
-    return torch.stack([masks, counts.cumsum(0) - counts], -1).to(torch.int32)
-
-
 def brick_numbers(columns: Int[Tensor, "N 2"], mpis: Sequence[MPIPlan]) -> Iterator[Int[Tensor, "P Y X"]]:
     """Brick of every tile of each MPI from the columns of all; -1 if it is empty."""
     bits = bits_of(columns[:, 0])
@@ -169,8 +163,8 @@ def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Te
     padded = torch.nn.functional.pad(stored, (0, 0, 0, 0, 0, -planes % WORD))
     bits = padded.view(-1, WORD, down, across).permute(0, 2, 3, 1).reshape(-1, WORD)
     masks = (bits.to(torch.int64) << torch.arange(WORD)).sum(-1)
-    masks = torch.where(masks >= 2**31, masks - 2**32, masks)
-    columns = numbered_columns(masks) + torch.tensor([0, first], dtype=torch.int32)
+    counts = bits.sum(-1)
+    columns = torch.stack([torch.where(masks >= 2**31, masks - 2**32, masks), first + counts.cumsum(0) - counts], -1)
     column, bit = bits.nonzero().unbind(-1)
     word, place = column // (down * across), column % (down * across)
-    return columns, torch.stack([word * WORD + bit, place // across, place % across], -1)
+    return columns.to(torch.int32), torch.stack([word * WORD + bit, place // across, place % across], -1)

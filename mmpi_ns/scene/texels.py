@@ -116,7 +116,7 @@ class TexelGrid:
 
 def _cell(coordinate: Float[Tensor, "N"], size: int) -> tuple[Int[Tensor, "N"], Float[Tensor, "N"]]:
     """Lower texel and fraction of a coordinate in [-1, 1] over ``size`` texels; outside it clamps to the border."""
-    position = ((coordinate + 1) * (0.5 * (size - 1))).clamp(0, size - 1)
+    position = ((coordinate + 1) * (0.5 * (size - 1))).clamp(min=0).clamp(max=size - 1)
     lower = position.floor().clamp(max=size - 2)
     return lower.to(torch.int64), position - lower
 

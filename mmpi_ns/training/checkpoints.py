@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import pickle
 import re
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ import torch
 from filelock import FileLock, Timeout
 from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim import Optimizer
 
+from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.phases import Schedule
@@ -124,6 +127,17 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not is_ours or "_model.progress.windows_bytes" not in state["pipeline"]:
         raise InputError(f"{path} holds no scene plan: it was not written by this method.")
     return state
+
+
+def states_of(pipeline: nn.Module, optimizers: Mapping[str, Optimizer], goes_on: bool) -> dict[str, Any]:
+    """The states of a pipeline and its optimisers for a file. After the last step nobody needs the moments, which are
+    half of all, nor more digits than images show."""
+    state = pipeline.state_dict() if goes_on else in_half_precision(pipeline.state_dict())
+    # A tensor of zeros alone, as untrained reliability, takes one number.
+    zeros = {k: v.new_zeros(()).expand(v.shape) for k, v in state.items() if v.numel() > 1 and not v.any()}
+    unused: dict[str, Any] = {} if goes_on else {"state": {}}
+    moments = {k: v.state_dict() | unused for k, v in optimizers.items()}
+    return {"pipeline": {**state, **zeros}, "optimizers": moments}
 
 
 def cameras_in_short(observations: Observations) -> Float[Tensor, "M 18"]:

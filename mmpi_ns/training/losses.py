@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mmpi_ns.capture.ray_sources import EXPOSURE, KEYPOINT_DEPTH, PIXEL_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops.depth_sums import DepthSums, depth_sums
 from mmpi_ns.rendering.rendered import RenderedRays
 
@@ -145,9 +144,9 @@ def batch_losses(
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)
     # If MPIs train separately and cover a ray only in part, they need not explain the remaining transmittance.
-    explained = rays.report.explained[pixels]
+    explained = rays.samples.explained[pixels]
     background = torch.where(explained, random, observed)
-    shown = (rays.colors.rgb, rays.colors.mass, rays.colors.first, rays.colors.second, rays.composite.transmittance)
+    shown = (rays.rgb, rays.sums.mass, rays.sums.first, rays.sums.second, rays.composite.transmittance)
     colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in shown)
     rgb = colors + transmittance * background
     sums = _depth_sums(rays, field)
@@ -174,7 +173,7 @@ def batch_losses(
 
 def _depth_sums(rays: RenderedRays, field: MMPIField) -> DepthSums:
     """Of all rays; the target is a keypoint or the known depth of a pixel."""
-    meta, bundle = metadata_of(rays.samples), rays.bundle
+    samples, bundle = rays.samples, rays.bundle
     targets = bundle.metadata.get(PIXEL_DEPTH)
     targets = bundle.origins.new_zeros(len(bundle), 2) if targets is None else targets
     # The spacing of planes in inverse distance: a surface between two is represented by both. Of the densest ones, as
@@ -186,9 +185,8 @@ def _depth_sums(rays: RenderedRays, field: MMPIField) -> DepthSums:
         keypoints = bundle.metadata[KEYPOINT_DEPTH]
         windows = torch.cat([keypoints, KEYPOINT_WIDTH * keypoints], -1)
         targets = torch.where(keypoints > 0, windows, targets)
-    weights, inverse_t, valid = rays.composite.weights, meta["inverse_t"][..., 0], meta["valid"][..., 0]
-    intervals = 1 / rays.report.live.clamp(min=1).to(weights)
-    return depth_sums(weights, inverse_t, valid, intervals, targets, field.plan.content_near)
+    weights, intervals = rays.composite.weights, 1 / samples.live.clamp(min=1).to(rays.rgb)
+    return depth_sums(weights, samples.inverse_t, samples.valid, intervals, targets, field.plan.content_near)
 
 
 def over_background(image: Tensor, background: Tensor | float) -> Tensor:

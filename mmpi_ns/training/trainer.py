@@ -19,7 +19,6 @@ from nerfstudio.utils import comms, writer
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.capture.new_views import image_and_mask
-from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, has_details, moved_cameras, write_details
 from mmpi_ns.scene.texels import BRICK
@@ -32,6 +31,7 @@ from mmpi_ns.training.checkpoints import (
     checkpoints_in,
     claim,
     read_checkpoint,
+    states_of,
     write_plan,
 )
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
@@ -134,7 +134,6 @@ class MMPITrainer(Trainer):
                 torch.cuda.set_device(self.local_rank)
             self._stopped_by: int | None = None
             self._log: TrainingLog | None = None
-            self._began = monotonic()
             config = self.config
             model_config: Any = config.pipeline.model
             model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
@@ -209,8 +208,7 @@ class MMPITrainer(Trainer):
         self._rays = {"pixel": manager.config.train_num_rays_per_batch, "keypoint": manager.config.keypoint_rays}
         if self._follows_capture:
             self.config.steps_per_save = max(self.config.steps_per_save, self._window_steps // 4)
-        # nerfstudio shows what is left
-        self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps
+        self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps  # nerfstudio shows these
         config: dict[str, Any] = {
             name: entry | {"scheduler": copy.copy(entry["scheduler"])} for name, entry in self.config.optimizers.items()
         }
@@ -324,7 +322,7 @@ class MMPITrainer(Trainer):
         """Makes the details that a finished run in this folder lacks, as it was stopped meanwhile."""
         model, self._last_step = cast(Any, self.pipeline.model), self._start_step - 1
         is_whole = self._start_step > self._total_steps or self._last_step not in checkpoints_in(self.checkpoint_dir)
-        is_whole |= not model.config.rendering.nearest_images
+        is_whole = is_whole or not model.config.rendering.nearest_images
         is_whole = is_whole or has_details(self.base_dir / DETAILS_FOLDER, self._last_step)
         left = "nothing to do" if is_whole else "details of its training images are made"
         say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
@@ -354,16 +352,7 @@ class MMPITrainer(Trainer):
             return  # stopped before the first step: there is nothing to save
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        # After the last step nobody needs the moments, which are half of all, nor more digits than images show.
-        goes_on, pipeline = step + 1 < self._total_steps, self.pipeline.state_dict()
-        unused: dict[str, Any] = {} if goes_on else {"state": {}}
-        pipeline = pipeline if goes_on else in_half_precision(pipeline)
-        # A tensor of zeros alone, as untrained reliability, takes one number.
-        zeros = {k: v.new_zeros(()).expand(v.shape) for k, v in pipeline.items() if v.numel() > 1 and not v.any()}
-        state = {
-            "step": step,
-            "pipeline": {**pipeline, **zeros},
-            "optimizers": {k: v.state_dict() | unused for k, v in self.optimizers.optimizers.items()},
+        parts = {
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
             "rng": {"torch": torch.get_rng_state()},
@@ -373,6 +362,8 @@ class MMPITrainer(Trainer):
                 "cameras": cameras_in_short(self._manager.observations),
             },
         }
+        models = self.pipeline, self.optimizers.optimizers
+        state = {"step": step, **parts, **states_of(*models, goes_on=step + 1 < self._total_steps)}
         write_atomically(path, lambda p: torch.save(state, p), self.base_dir)
         if self.config.save_only_latest_checkpoint:
             progress = self._run.progress  # checkpoints of other windows are other processes' work
@@ -384,11 +375,10 @@ class MMPITrainer(Trainer):
     def _load_checkpoint(self) -> None:
         path, run = checkpoint_to_load(self.config), self._run
         if path is not None:
-            state, model = read_checkpoint(path), cast(Any, self.pipeline.model)
-            capture, mode = self._manager, model.camera_optimizer.config.mode
+            state, capture, model = read_checkpoint(path), self._manager, cast(Any, self.pipeline.model)
+            here = (capture.get_datapath(), capture.observations, run.progress.windows)
             rays = self._rays if self._follows_capture else None
-            run_here = (capture.get_datapath(), capture.observations, run.progress.windows, mode, rays)
-            check_same_run(state, path, *run_here)
+            check_same_run(state, path, *here, model.camera_optimizer.config.mode, rays)
             torch.set_rng_state(state["rng"]["torch"])
             del state
         # nerfstudio takes every file in load_dir for a checkpoint.

@@ -16,19 +16,19 @@ from random_fields import bundle, random_field, random_rays
 from suites import DEFAULT, SUITES
 
 from mmpi_ns.bench.trainers import Scene
+from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.errors import PixelErrors
 from mmpi_ns.rendering.rendered import render_rays
-from mmpi_ns.rendering.sampler import MMPISampler
 
 
 def test_the_dense_reference_renders_what_the_sampler_renders():
     field = random_field(3)
     field.features.data.mul_(0.3)
     rays = bundle(*random_rays(field.plan, 64, seed=1))
-    ours = render_rays(MMPISampler(), rays, field, blends=False, threshold=0.0)
+    ours = render_rays(rays, field, MarchOptions(0.0))
     reference, samples = render_densely(field, rays)
     # The reference leaves out colours below alpha = 1e-4, so they may differ by that much a sample.
-    found = ours.colors.rgb + 0.5 * ours.composite.transmittance
+    found = ours.rgb + 0.5 * ours.composite.transmittance
     assert samples == 36 and float((found - reference).abs().max()) < 5e-3
     assert float(found.std()) > 0.05
 

@@ -12,8 +12,8 @@ from hand_made import make_mpi
 from random_fields import _places, _table, fill, random_field
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.rendering.baked import bake_shares, rays_to
-from mmpi_ns.scene.plan import CubePlan, ScenePlan
+from mmpi_ns.rendering.baked import bake_shares
+from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 
 
@@ -21,12 +21,8 @@ def oracle_share(field, k, z, y, x):
     """P of one texel in float64, and how close a decision was."""
     grid, plan = field.grids[k], field.plan
     ndc = np.array([2 * i / (n - 1) - 1 for i, n in zip((x, y, z), (grid.width, grid.height, grid.depth), strict=True)])
-    if k < len(plan.mpis):
-        point, far = oracle.ndc_to_world(plan.mpis[k], ndc)
-        places = _places(plan, np.zeros(3), point, 0.0 if far else 1.0)
-    else:
-        lower, upper = np.array(plan.cube.lower), np.array(plan.cube.upper)
-        places = _places(plan, np.zeros(3), lower + (ndc + 1) / 2 * (upper - lower), 1.0)
+    point, far = oracle.ndc_to_world(plan.mpis[k], ndc)
+    places = _places(plan, np.zeros(3), point, 0.0 if far else 1.0)
     votes, cover, margin = np.zeros(len(places)), np.zeros(len(places), bool), math.inf
     for j, place in enumerate(places):
         if j == k:
@@ -44,9 +40,8 @@ def oracle_share(field, k, z, y, x):
     return math.exp(oracle.log_shares(votes, cover, k)[0]), margin
 
 
-@pytest.mark.parametrize("with_cube", [False, True])
-def test_every_texel_has_the_share_that_the_oracle_has(with_cube):
-    field, rng = random_field(3, with_cube, seed=7, planes=9), np.random.default_rng(0)
+def test_every_texel_has_the_share_that_the_oracle_has():
+    field, rng = random_field(3, False, seed=7, planes=9), np.random.default_rng(0)
     field.touched.copy_(torch.tensor(rng.uniform(size=len(field.touched)) < 0.8))
     shares, checked, seen = bake_shares(field), 0, set()
     for _ in range(300):
@@ -82,14 +77,3 @@ def test_shares_that_are_the_same_everywhere_are_baked_as_they_are():
 
 def test_a_single_head_has_all():
     assert (bake_shares(random_field(1, seed=2)) == 1).all()
-
-
-def test_a_texel_on_the_border_of_the_cube_and_one_at_infinity_have_rays():
-    field = fill(
-        MMPIField(ScenePlan((make_mpi(),), CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 4.0), (4, 4, 4)), 0.05, 1.0)), 1
-    )
-    corner = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    origins, directions, inverse_t = rays_to(field, 1, corner)
-    assert torch.equal(origins + directions / inverse_t[:, None], torch.tensor([[-1.0, -1.0, 2.0], [1.0, 1.0, 4.0]]))
-    assert rays_to(field, 0, corner)[2].tolist() == [1.0, 0.0]
-    assert torch.isfinite(bake_shares(field)).all()

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import torch
 from hand_made import make_mpi
-from nerfstudio.field_components.field_heads import FieldHeadNames
-from random_fields import bundle, fill, random_field, random_plan, random_rays, render
+from random_fields import bundle, fill, random_field, random_plan, random_rays, render, sampled
 from random_scenes import dense_grad
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.ops.blending import log_shares
-from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.geometry import LocalRays
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
@@ -24,10 +22,6 @@ TABLES = ("density", "features", "reliability")
 
 def one_mpi(**size):
     return ScenePlan((make_mpi(extent=(-1.0, 1.0, -1.0, 1.0), **size),), None, 0.05, 1.0)
-
-
-def sampled(field, rays, threshold=0.0):
-    return MMPISampler()(rays, field=field, threshold=threshold)[0]
 
 
 def block(field, k, table="features"):
@@ -41,7 +35,7 @@ def block(field, k, table="features"):
 @pytest.mark.parametrize("planes", [2, 16, 64, 256])
 def test_every_plane_starts_with_an_equal_share_of_a_ray_that_crosses_all(planes):
     found = render(MMPIField(one_mpi(planes=planes)).eval(), bundle([[0, 0, 0]], [[0.1, 0.2, 0.97]]))
-    assert found.samples.shape == (1, planes)
+    assert found.samples.valid.shape == (1, planes)
     # The last plane is not quite opaque: all that reaches it is 1/L, of which it takes 99.9 %.
     assert torch.allclose(found.composite.weights, torch.tensor(1 / planes), rtol=2e-3)
     assert found.composite.transmittance.item() == pytest.approx(0.001 / planes, rel=0.05)
@@ -63,7 +57,7 @@ def test_a_sample_of_the_cube_starts_with_the_alpha_asked_for_at_any_sampling_ra
     plan = ScenePlan((make_mpi(axes=((-1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0))),), cube, 0.05, 1.0)
     field = MMPIField(plan, cube_alpha=alpha, samples_per_voxel=per_voxel).eval()
     found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]))
-    assert found.report.live.item() == 8 * per_voxel  # 2 units of length, 8 voxel sides
+    assert found.samples.live.item() == 8 * per_voxel  # 2 units of length, 8 voxel sides
     assert found.composite.transmittance.item() == pytest.approx((1 - alpha) ** (8 * per_voxel), rel=1e-5)
 
 
@@ -97,8 +91,8 @@ def test_growing_keeps_the_parameters_and_a_bilinear_field():
     assert field.density.shape == (rows, 1) and field.plan == plan and field.touched.shape == (rows,)
     assert float(field.texel_factor) == 1.0 and [g.width for g in field.grids] == [7, 7, 4]
     fine = render(field, rays)
-    assert (coarse.report.live > 3).any()
-    mpi_only = (coarse.samples.metadata["heads"] < 2).all(1)[:, 0]  # the cube's samples lie closer when it grows
+    assert (coarse.samples.live > 3).any()
+    mpi_only = (coarse.samples.heads < 2).all(1)  # the cube's samples lie closer when it grows
     assert mpi_only.sum() > 5
     assert torch.allclose(coarse.composite.transmittance[mpi_only], fine.composite.transmittance[mpi_only], atol=1e-5)
     assert torch.allclose(coarse.rgb[mpi_only], fine.rgb[mpi_only], atol=1e-5)
@@ -140,7 +134,7 @@ def test_released_texels_are_empty_and_the_others_stay_as_they_are(plan):
     field.touched.fill_(0)
     field.release_untouched()
     found = render(field, bundle(*random_rays(plan, 20, seed=0)))
-    assert found.report.live.max() > 8
+    assert found.samples.live.max() > 8
     assert found.composite.weights.max() < 1e-6 and found.composite.transmittance.min() > 0.9999
 
 
@@ -174,9 +168,9 @@ def test_a_head_votes_inside_its_frustum_where_it_was_trained_and_a_sample_count
 def trained_once(field, rays):
     field.train()
     samples = sampled(field, rays)
-    tau, lookup = field.get_density(samples)
-    rgb = field.get_outputs(samples, lookup)[FieldHeadNames.RGB]
-    (tau.sum() + (rgb * tau.detach()).sum()).backward()
+    tau, lookup = field.get_density(*samples)
+    rgb = field.get_outputs(*samples, lookup)
+    (tau.sum() + (rgb * tau.detach()[..., None]).sum()).backward()
     return samples, lookup
 
 
@@ -199,7 +193,7 @@ def test_texels_count_as_trained_only_before_blending_and_in_training(plan, case
     field = fill(MMPIField(plan), seed=5).train(case != "evaluating")
     field.learns_cover = case != "blending"
     field.touched.fill_(0)
-    field.get_density(sampled(field, bundle(*random_rays(plan, 3, seed=2))))
+    field.get_density(*sampled(field, bundle(*random_rays(plan, 3, seed=2))))
     assert field.touched.sum() == 0
 
 
@@ -207,8 +201,8 @@ def test_reliability_learns_where_heads_overlap(plan):
     field = fill(MMPIField(plan), seed=6)
     rays = bundle(np.zeros((2, 3)), [[0, 0, 1], [0.7, 0.2, 0.7]])
     samples = sampled(field, rays)
-    _, lookup = field.get_density(samples)
-    log_p, _ = field.sample_shares(samples, lookup)
+    _, lookup = field.get_density(*samples)
+    log_p, _ = field.sample_shares(*samples, lookup)
     log_p[lookup.heads == 0].sum().backward()
     grad = dense_grad(field.reliability)
     for grid in field.grids:
@@ -222,7 +216,7 @@ def test_total_variation_is_the_sum_over_touched_texels_and_their_neighbours(wit
     cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (3, 2, 4)) if with_cube else None
     field = fill(MMPIField(ScenePlan(mpis, cube, 0.05, 1.0), feature_channels=4), seed=7, log_depths=(-2, 0.5))
     samples = sampled(field, bundle([[0, 0, 0]], [[-0.4, -0.15, 0.9]]))
-    _, lookup = field.get_density(samples)
+    _, lookup = field.get_density(*samples)
     touched = {row for taps in lookup.taps for row in lookup.rows[taps.positions].reshape(-1).tolist()}
     wanted, gradient, size = 0.0, np.zeros(len(field.density)), field.plan.texels
     for k, grid in enumerate(field.grids):
@@ -257,7 +251,7 @@ def test_differences_of_chroma_count_more_in_the_gradient_of_features_alone():
     samples, gradients = sampled(field, bundle([[0, 0, 0]], [[-0.4, -0.15, 0.9]])), []
     for times in (0.0, 7.0):
         field.zero_grad(set_to_none=True)
-        _, lookup = field.get_density(samples)
+        _, lookup = field.get_density(*samples)
         lookup.density.retain_grad(), lookup.features.retain_grad()
         (3 * field.total_variation(lookup, 1.0, 1.0, times) + lookup.features.sum()).backward()
         gradients.append((lookup.density.grad, lookup.features.grad.double()))
@@ -272,10 +266,10 @@ def test_differences_of_chroma_count_more_in_the_gradient_of_features_alone():
 
 def test_a_batch_without_samples_has_no_variation_and_no_density(plan):
     field = MMPIField(plan)
-    tau, lookup = field.get_density(sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]])))
-    assert tau.shape == (1, 1, 1) and tau.item() == 0
+    tau, lookup = field.get_density(*sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]])))
+    assert tau.shape == (1, 1) and tau.item() == 0
     assert field.total_variation(lookup, 1.0, 1.0).item() == 0
-    assert field.get_outputs(sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]])))[FieldHeadNames.RGB].abs().sum() == 0
+    assert field.get_outputs(*sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]]))).abs().sum() == 0
 
 
 # State ---------------------------------------------------------------------------------------------------------------
@@ -298,7 +292,7 @@ def test_a_state_dict_brings_its_own_plan_and_resolution(ours, theirs, factor):
         assert torch.equal(read.state_dict()[name], value), name
     rays = bundle(*random_rays(written.plan, 12, seed=3))
     a, b = (render(f.eval(), rays, blends=theirs > 1) for f in (written, read))
-    assert torch.equal(a.rgb, b.rgb) and torch.equal(a.report.live, b.report.live) and a.report.live.any()
+    assert torch.equal(a.rgb, b.rgb) and torch.equal(a.samples.live, b.samples.live) and a.samples.live.any()
 
 
 def test_a_plan_written_before_a_field_was_added_loads_and_stays_as_it_was_written(plan):

@@ -10,8 +10,8 @@ from random_fields import OracleRay, bundle, fill, random_field, random_plan, ra
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.rendering.rendered import render_rays
-from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import ScenePlan
 
 STEP = 1e-6
@@ -43,9 +43,9 @@ def by_differences(field, origin, direction, near=0.05):
 def by_autograd(field, rays):
     """The same [R, 6] by the fast path."""
     o, d = rays.origins.requires_grad_(), rays.directions.requires_grad_()
-    found = render_rays(MMPISampler(), rays, field, blends=False, threshold=0.0)
+    found = render_rays(rays, field, MarchOptions(0.0))
     mix = torch.tensor(MIX).to(o)
-    total = (found.colors.rgb @ mix[:3] + mix[3] * found.composite.transmittance[:, 0]).sum()
+    total = (found.rgb @ mix[:3] + mix[3] * found.composite.transmittance[:, 0]).sum()
     grads = torch.autograd.grad(total + 0 * (o + d).sum(), (o, d))  # also where no ray meets anything
     return torch.cat(grads, -1).double().numpy()
 
@@ -126,9 +126,9 @@ def test_rays_shaded_once_have_the_gradients_of_float64_also_through_a_frozen_fi
 def test_samples_stay_where_they_are_to_the_bit_and_rays_that_do_not_move_cost_nothing():
     field = random_field(2, True, seed=3)
     rays = bundle(*random_rays(field.plan, 20, seed=4))
-    still = render_rays(MMPISampler(), rays, field, blends=False, threshold=0.0)
+    still = render_rays(rays, field, MarchOptions(0.0))
     rays.origins.requires_grad_()
-    moving = render_rays(MMPISampler(), rays, field, blends=False, threshold=0.0)
+    moving = render_rays(rays, field, MarchOptions(0.0))
     assert still.lookup is not None and moving.lookup is not None
     assert not still.lookup.ndc.requires_grad and moving.lookup.ndc.requires_grad
     assert torch.equal(still.lookup.ndc, moving.lookup.ndc) and still.lookup.ndc.std() > 0.1

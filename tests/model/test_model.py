@@ -108,8 +108,8 @@ def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_
     trainer = trainer_of(scene, plan_file, tmp_path, sampling__threshold=0.0)
 
     def heads_of_rays(step):
-        meta = run_step(trainer, step)[0].samples.metadata
-        return [tuple(sorted(set(h[v].tolist()) - {2})) for h, v in zip(meta["heads"], meta["valid"], strict=True)]
+        samples = run_step(trainer, step)[0].samples
+        return [tuple(sorted(set(h[v].tolist()) - {2})) for h, v in zip(samples.heads, samples.valid, strict=True)]
 
     found = heads_of_rays(0)
     assert len(found) == 80 and set(found) == {(0,), (1,)}
@@ -122,7 +122,7 @@ def test_with_rays_per_mpi_all_every_mpi_renders_every_ray_alone_with_the_cube(s
     plan = write_plan(scene, tmp_path / "plan.json", num_mpis=3, with_cube=True)
     trainer = trainer_of(scene, plan, tmp_path, rays_per_mpi="all", sampling__threshold=0.0)
     rays, losses, _ = run_step(trainer, 0)
-    heads, valid = rays.samples.metadata["heads"], rays.samples.metadata["valid"]
+    heads, valid = rays.samples.heads, rays.samples.valid
     assert len(rays.bundle) == 3 * 80
     for k in range(3):
         part = slice(80 * k, 80 * (k + 1))
@@ -179,8 +179,8 @@ def test_the_cube_learns_from_the_first_step_at_the_default_settings(scene, plan
         cube_alpha=config.cube_alpha, sampling__threshold=config.threshold,
     )  # fmt: skip
     rays, losses, _ = run_step(trainer, 0)
-    live = rays.report.live.sum() - (rays.samples.metadata["heads"][rays.samples.metadata["valid"]] < 2).sum()
-    kept = (rays.samples.metadata["heads"][rays.samples.metadata["valid"]] == 2).sum()
+    live = rays.samples.live.sum() - (rays.samples.heads[rays.samples.valid] < 2).sum()
+    kept = (rays.samples.heads[rays.samples.valid] == 2).sum()
     assert live > 100 and kept > 0.5 * live
     sum(losses.values()).backward()
     field = trainer.pipeline.model.field

@@ -12,15 +12,14 @@ from bricked import bricked_field
 from hand_made import make_mpi, random_mpi
 from hard_rays import HARD_RAYS, hard_plan, hard_rays
 from interpreting import by_torch, interpreted, normal  # noqa: F401
-from random_fields import OracleRay, bundle, fill, random_field, random_rays, render
+from random_fields import OracleRay, bundle, fill, random_field, random_rays, render, sampled
 from random_scenes import dense_grad
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import blending, composite
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import MarchOptions, gpu, march
-from mmpi_ns.rendering.sampler import MMPISampler, rays_of
+from mmpi_ns.rendering.rendered import rays_of
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 # Crossings -----------------------------------------------------------------------------------------------------------
@@ -86,7 +85,7 @@ def test_only_heads_that_may_answer_a_ray_do_and_it_is_explained_as_by_the_refer
     priorities = torch.rand(60, 4, generator=g)
     for chosen in ({"head_mask": mask}, {"choose": priorities}, {"head_mask": mask, "choose": priorities}):
         _, plain = compare(field, rays, 1e-3, **chosen)
-        seen |= set(plain.report.explained.flatten().tolist())
+        seen |= set(plain.samples.explained.flatten().tolist())
     assert seen == {True, False}
 
 
@@ -97,12 +96,12 @@ def compare(field, rays, threshold, blends=False, **chosen):
     """The kernel's samples are the reference's; returns the kernel's rendering and the reference's."""
     fast = render(field, rays, threshold, blends, **chosen)
     plain = by_torch(lambda: render(field, rays, threshold, blends, **chosen))
-    kept, wanted = fast.samples.metadata, plain.samples.metadata
+    kept, wanted = vars(fast.samples), vars(plain.samples)
     assert kept["valid"].shape == wanted["valid"].shape
     # A sample whose weight is the threshold's to the last bits may fall on either side of it.
-    same = (kept["valid"].sum(1) == wanted["valid"].sum(1))[:, 0]
+    same = kept["valid"].sum(1) == wanted["valid"].sum(1)
     assert same.float().mean() >= 0.95
-    valid = wanted["valid"][same][..., 0]
+    valid = wanted["valid"][same]
     for name, error in (("heads", 0), ("planes", 0), ("ndc", 2e-6), ("inverse_t", 3e-5), ("tau", 2e-5)):
         a, b = (m[name][same][valid].double() for m in (kept, wanted))
         assert ((a - b).abs() <= error * (1 + b.abs())).all(), name
@@ -110,9 +109,9 @@ def compare(field, rays, threshold, blends=False, **chosen):
         assert (kept[name][~kept["valid"][..., 0]] == 0).all(), "empty slots are 0"
     before = [m["skipped_before"][same][valid] for m in (kept, wanted)]
     assert torch.allclose(*before, atol=2e-5)
-    assert torch.equal(fast.report.live, plain.report.live)
-    assert torch.equal(fast.report.explained, plain.report.explained)
-    difference = (fast.report.dropped_mass - plain.report.dropped_mass)[same]
+    assert torch.equal(fast.samples.live, plain.samples.live)
+    assert torch.equal(fast.samples.explained, plain.samples.explained)
+    difference = (fast.samples.dropped_mass - plain.samples.dropped_mass)[same]
     if difference.numel():
         assert difference.min() > -2e-6 and difference.max() < 1.2e-5, "what is not visited counts as dropped"
         assert (fast.composite.transmittance - plain.composite.transmittance).abs()[same].max() < 1.2e-5
@@ -126,9 +125,9 @@ def test_the_march_keeps_what_the_reference_keeps(monkeypatch, blends, threshold
     monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
     field = random_field(3, True, seed=3, planes=14)
     _, plain = compare(field, bundle(*random_rays(field.plan, 40, seed=1)), threshold, blends)
-    valid = plain.samples.metadata["valid"]
-    assert plain.samples.metadata["heads"][valid].unique().numel() == 4
-    assert (plain.report.dropped_mass > 1e-3).any() == (threshold > 0)
+    valid = plain.samples.valid
+    assert plain.samples.heads[valid].unique().numel() == 4
+    assert (plain.samples.dropped_mass > 1e-3).any() == (threshold > 0)
 
 
 def test_rays_pass_what_holds_nothing_like_the_reference():
@@ -145,8 +144,8 @@ def test_nine_heads_and_several_programs_march_like_the_reference(monkeypatch):
 def test_a_fair_share_keeps_what_a_threshold_alone_would_drop():
     field = MMPIField(ScenePlan((make_mpi(planes=40),), None, 0.05, 1.0)).eval()  # all weights are 1/40
     rays = bundle([[0, 0, 0]], [[0, 0, 1]])
-    assert compare(field, rays, 0.1)[0].samples.metadata["valid"].sum() == 0
-    assert compare(field, rays, 0.1, fair_share=0.1)[0].samples.metadata["valid"].sum() == 40
+    assert compare(field, rays, 0.1)[0].samples.valid.sum() == 0
+    assert compare(field, rays, 0.1, fair_share=0.1)[0].samples.valid.sum() == 40
 
 
 def test_rays_render_as_the_oracle_has_them():
@@ -159,7 +158,7 @@ def test_rays_render_as_the_oracle_has_them():
             if exact.margin < 1e-5:
                 continue
             wanted, checked = exact.render(blends), checked + 1
-            assert int(fast.samples.metadata["valid"][i].sum()) == len(wanted.samples)
+            assert int(fast.samples.valid[i].sum()) == len(wanted.samples)
             assert np.abs(fast.rgb[i].double().numpy() - wanted.color).max() < 5e-5
             weights = fast.composite.weights[i, : len(wanted.samples)].double().numpy()
             assert np.abs(weights - wanted.weights).max() < 5e-5
@@ -178,36 +177,36 @@ def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monke
     rays = hard_rays()
     for blends, threshold in ((False, 0.0), (False, 1e-3), (True, 1e-3)):
         fast, _ = compare(field.eval(), rays, threshold, blends)
-        found = fast.samples.metadata
-        tensors = [fast.rgb, fast.composite.weights, fast.report.dropped_mass, *found.values()]
+        found = {n: x for n, x in vars(fast.samples).items() if isinstance(x, torch.Tensor)}
+        tensors = [fast.rgb, fast.composite.weights, *found.values()]
         assert all(torch.isfinite(t.float()).all() for t in tensors)
     names = list(HARD_RAYS)
     heads = found["heads"][names.index("on the axis")][found["valid"][names.index("on the axis")]]
     assert raw != 0 or (heads == 1).any(), "equal distances: the twin's samples follow the first MPI's"
-    assert fast.report.live[names.index("along the planes")] == 0 and fast.report.live[names.index("backwards")] > 0
+    assert fast.samples.live[names.index("along the planes")] == 0 and fast.samples.live[names.index("backwards")] > 0
 
 
 def test_behind_an_opaque_plane_the_march_visits_nothing_and_loses_a_hundred_thousandth():
     field = MMPIField(ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)).eval()
     field.density.data[field.grids[0].rows[: 10 * field.grids[0].height * field.grids[0].width]] = 30.0
     found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
-    assert found.report.live.item() == 64 and found.samples.metadata["valid"].sum() == 1
-    assert found.report.skipped_total.item() == 0 and found.report.dropped_mass.item() <= 1e-5
+    assert found.samples.live.item() == 64 and found.samples.valid.sum() == 1
+    assert found.samples.skipped_total.item() == 0 and found.samples.dropped_mass.item() <= 1e-5
 
 
 def test_without_rays_or_samples_there_is_nothing_to_march():
     field = MMPIField(ScenePlan((make_mpi(),), None, 0.05, 1.0)).eval()
     away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blends=True)
-    assert away.samples.metadata["valid"].sum() == 0 and away.composite.accumulation.item() == 0
-    samples, report = MMPISampler()(bundle(torch.zeros(0, 3), torch.zeros(0, 3)), field=field, threshold=1e-3)
-    assert samples.shape[0] == 0 and report.live.shape == (0,)
+    assert away.samples.valid.sum() == 0 and away.composite.accumulation.item() == 0
+    _, samples = sampled(field, bundle(torch.zeros(0, 3), torch.zeros(0, 3)), 1e-3)
+    assert samples.valid.shape[0] == 0 and samples.live.shape == (0,)
 
 
 def test_densities_that_are_no_numbers_end_the_march_all_the_same():
     field = random_field(2, False, seed=1, planes=10)
     field.density.data.fill_(math.nan)
-    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 5, seed=1)), field=field, threshold=1e-3)
-    assert samples.shape[0] == 5
+    _, samples = sampled(field, bundle(*random_rays(field.plan, 5, seed=1)), 1e-3)
+    assert samples.valid.shape[0] == 5
 
 
 def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
@@ -217,16 +216,13 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
 
     def gradients():
         field.zero_grad(set_to_none=True)
-        samples, report = MMPISampler()(rays, field=field, threshold=1e-3, blends=True)
-        tau, lookup = field.get_density(samples)
-        share = field.sample_shares(samples, lookup)
+        _, samples = sampled(field, rays, 1e-3, blends=True)
+        tau, lookup = field.get_density(rays, samples)
+        share = field.sample_shares(rays, samples, lookup)
         flat = blending.blended_optical_depth(tau.reshape(-1)[lookup.index], *share)
-        tau = tau.new_zeros(tau[..., 0].numel()).index_put((lookup.index,), flat).view(tau.shape[:2])
-        meta = metadata_of(samples)
-        made = composite.composite_weights(
-            tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total
-        )  # fmt: skip
-        colors = next(iter(field.get_outputs(samples, lookup).values()))
+        tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
+        made = composite.composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
+        colors = field.get_outputs(rays, samples, lookup)
         loss = (composite.render_colors(made, colors) * upstream).sum() + made.accumulation.sum()
         (loss + 0.1 * field.total_variation(lookup, 1.0, 1.0)).backward()
         return {n: dense_grad(p) if isinstance(p, Table) else p.grad for n, p in params.items()}

@@ -1,4 +1,4 @@
-"""The Triton kernels of tables, colours and compositing: run like interpreted_march.py."""
+"""Tables and colours as on a GPU, by Triton kernels or plain torch: run like interpreted_march.py."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import pytest
 import torch
 from bricked import SHAPES, bricked_field, layout_of, thinned
 from gather_batches import batch, in_float32, with_gradients
-from interpreting import by_torch, interpreted, normal  # noqa: F401
+from interpreting import interpreted, normal  # noqa: F401
 from random_scenes import dense_grad
 
-from mmpi_ns.ops import composite, gather, interpolate
+from mmpi_ns.ops import gather, interpolate
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.variation import total_variation
-from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Rows ----------------------------------------------------------------------------------------------------------------
 
@@ -119,26 +118,6 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
 
 
-def test_adam_on_rows_equals_the_plain_one():
-    def work():
-        param = Table(normal(500, 9))
-        optimizer = TouchedAdam([param], lr=0.1)
-        for step in range(4):
-            rows = torch.randperm(500, generator=torch.Generator().manual_seed(step))[:300].sort().values
-            values = normal(300, 9, seed=step)
-            values[:, step] = 0  # entries without a gradient within a touched row
-            param.grad = None
-            param.add_grad(rows, values)
-            optimizer.step()
-        return param.data, optimizer.state[param]["moments"].float()
-
-    fast, plain = work(), by_torch(work)
-    assert (plain[0] - normal(500, 9)).abs().max() > 0.2
-    for a, b in zip(fast, plain, strict=True):  # here and there a moment falls on the other side of a half
-        off = (a - b).abs()
-        assert (off <= 4e-6 * (1 + b.abs())).float().mean() > 0.995 and (off <= 2**-7 * b.abs() + 1e-3).all()
-
-
 # Colours -------------------------------------------------------------------------------------------------------------
 
 
@@ -167,43 +146,3 @@ def test_without_samples_rays_gather_nothing():
     assert all(s.shape[0] == 3 and not s.any() for s in vars(sums).values())
     sums.gathered.sum().backward()
     assert not weights.grad.any()
-
-
-# Compositing ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("slots", [1, 5, 70])
-def test_compositing_and_its_gradient_are_those_of_float64(slots):
-    g = torch.Generator().manual_seed(slots)
-    tau = 10 ** (torch.rand(40, slots, generator=g) * 6 - 5)
-    tau[0], tau[1], tau[2, : slots // 2] = 0.0, 1e4, 1e5
-    valid = torch.arange(slots) < torch.randint(0, slots + 1, (40, 1), generator=g)
-    before = torch.rand(40, slots, generator=g).cumsum(1) * 0.02
-    total = before[:, -1:] + 0.1
-    upstream = [normal(40, slots, seed=1), normal(40, 1, seed=2), normal(40, 1, seed=3)]
-
-    def work(function, dtype):
-        leaf = tau.detach().to(dtype, copy=True).requires_grad_()
-        made = function(leaf, valid, before.to(dtype), total.to(dtype))
-        parts = (made.weights, made.accumulation, made.transmittance)
-        sum((p * u.to(dtype)).sum() for p, u in zip(parts, upstream, strict=True)).backward()
-        return [x.double() for x in (*parts, leaf.grad)]
-
-    fast = work(composite.composite_weights, torch.float32)
-    exact = work(composite.composite_weights.reference, torch.float64)
-    for a, b in zip(fast, exact, strict=True):
-        assert ((a - b).abs() <= 3e-6 * (1 + b.abs().amax(1, keepdim=True))).all()
-    assert (fast[0][~valid] == 0).all() and (fast[3][~valid] == 0).all()
-
-
-def test_thin_samples_keep_their_digits():
-    tau = torch.full((1, 3), 1e-7)
-    made = composite.composite_weights(tau, tau > 0, tau * 0, tau[:, :1] * 0)
-    assert made.weights.tolist()[0] == pytest.approx([1e-7] * 3, rel=1e-6)
-
-
-def test_no_rays_are_composited_to_nothing():
-    tau = torch.zeros(0, 4, requires_grad=True)
-    made = composite.composite_weights(tau, tau > 0, tau * 0, torch.zeros(0, 1))
-    made.weights.sum().backward()
-    assert made.weights.shape == (0, 4) and made.accumulation.shape == (0, 1)

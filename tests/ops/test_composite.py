@@ -154,7 +154,7 @@ def random_sample(rng, head, plane, heads, scale, inverse_t):
 
 
 def random_samples(rng, heads, scale):
-    """RaySamples of every head, some at equal distances."""
+    """Samples of every head, some at equal distances."""
     distances = -np.sort(-rng.integers(0, 30, size=(heads, 9)) / 16.0, axis=-1)
     return [
         [random_sample(rng, head, plane, heads, scale, q) for plane, q in enumerate(distances[head])]

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 import torch
 from gather_batches import batch, in_float32, parts_of, with_gradients
-from random_fields import bundle, random_field, random_rays
+from random_fields import bundle, random_field, random_rays, sampled
 
-from mmpi_ns.field.samples import metadata_of, places_of
 from mmpi_ns.ops.gather import Taps, gather_places, gather_taps
-from mmpi_ns.rendering.sampler import MMPISampler
 
 CHANNELS = (3, 8, 9, 16, 20)
 
@@ -122,17 +120,17 @@ def test_bits_do_not_depend_on_threads(threads, monkeypatch):
 @pytest.mark.parametrize("with_cube", [False, True])
 def test_at_places_sums_are_those_at_their_taps(with_cube):
     field = random_field(3, with_cube, seed=7)
-    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 60, seed=8)), field=field, threshold=0.0)
-    meta, lookup = metadata_of(samples), field.get_density(samples)[1]
+    rays, samples = sampled(field, bundle(*random_rays(field.plan, 60, seed=8)))
+    lookup = field.get_density(rays, samples)[1]
     weights = torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
-    places = places_of(samples)
+    places = samples.places
     table, everything = field.features.data, torch.ones(60, dtype=torch.bool)
     taps = [Taps(lookup.rows[t.positions], t.weights.double()) for t in lookup.taps]
     exact = gather_taps.reference(table.double(), taps, lookup.index, weights.double(), everything)
     found = gather_places(field.layout, table, places, weights)
     for a, b in zip(parts_of(found), parts_of(exact), strict=True):
         assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
-    assert meta["heads"].unique().numel() == 3 + with_cube
+    assert samples.heads.unique().numel() == 3 + with_cube
 
 
 # Hard inputs ---------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from triton_processes import HERE, needs_triton, python
 from waits import TRAININGS, counted_on_a_gpu, waits_of_phases
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.interpolate import weighted_rows
+from mmpi_ns.ops.gather import gather_taps
 
 
 @needs_triton
@@ -61,7 +61,7 @@ def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
     from triton_compiling import all_launches, spills
 
     launches = all_launches(monkeypatch.setattr)
-    assert {"march_kernel", "pack_kernel", "gather_kernel", "adam_kernel"} < {x.name for x in launches}
+    assert {"march_kernel", "show_kernel", "gather_kernel", "variation_kernel"} < {x.name for x in launches}
     for launch in launches:
         assert not spills(launch.compiled(90)), (launch.name, launch.constants)
 
@@ -79,7 +79,7 @@ def test_the_tables_of_kernels_are_what_they_compile_to(monkeypatch):
         pytest.skip(f"the table is of Triton {content['made']['triton']}")
     plans = {str(number): launches for number, launches in launches_of_plans(monkeypatch.setattr).items()}
     assert {n: set(rows) for n, rows in plans.items()} == {n: set(rows) for n, rows in content["plans"].items()}
-    for number, name in (("4", "adam_kernel"), ("64", "variation_kernel")):
+    for number, name in (("4", "gather_back_kernel"), ("64", "variation_kernel")):
         assert measured(plans[number][name], 90) == content["plans"][number][name]["sm_90"]
 
 
@@ -179,14 +179,14 @@ def test_a_kernel_that_does_not_compile_for_a_shape_leaves_its_operation_to_plai
     def fails(*given):
         raise RuntimeError("`ptxas` failed with error code 255")
 
-    right, table = dispatch.function, torch.arange(6.0).view(3, 2)
-    monkeypatch.setattr(dispatch, "_faults", {"weighted_rows": None})
+    right, no_samples = dispatch.function, (torch.zeros(0, 4), [], torch.zeros(0).long())
+    monkeypatch.setattr(dispatch, "_faults", {"gather_taps": None})
     monkeypatch.setattr(dispatch, "form_of", lambda name, *tensors: "reference" if dispatch._faults[name] else "gpu")
     monkeypatch.setattr(dispatch, "function", lambda name, form: fails if form == "gpu" else right(name, form))
     for _ in range(2):
-        found = weighted_rows(table, torch.tensor([[2, 0]]), torch.tensor([[1.0, 0.5]]))
-        assert found.tolist() == [[4.0, 5.5]]
-    assert " ".join(capsys.readouterr().out.split()).count("Plain torch for weighted_rows") == 1
+        sums = gather_taps(*no_samples, torch.zeros(3, 2), torch.ones(3) > 0)
+        assert sums.gathered.tolist() == [[0.0] * 4] * 3
+    assert " ".join(capsys.readouterr().out.split()).count("Plain torch for gather_taps") == 1
 
 
 def test_on_a_cpu_nothing_takes_the_gpus_kernels():

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from typing import Any
 
 import pytest
 import torch
 from compiled import compiled, normal  # noqa: F401
-from nerfstudio.field_components.field_heads import FieldHeadNames
-from random_fields import bundle, random_field, random_rays
+from random_fields import bundle, random_field, random_rays, sampled
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import places_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.shade import Layers, SampleNetworks, shade
-from mmpi_ns.rendering.sampler import MMPISampler
 
 
 def shaded(channels=9, width=32, octaves=(2, 2)):
@@ -27,30 +25,29 @@ def shaded(channels=9, width=32, octaves=(2, 2)):
     field = MMPIField(plan, **sizes).eval()
     field.features.data = normal(*field.features.shape, seed=1) * 2
     field.networks.weights.data = normal(*field.networks.weights.shape, seed=2) * 0.3
-    samples, _ = MMPISampler()(bundle(*random_rays(plan, 60, seed=8)), field=field, threshold=0.0)
-    assert samples.metadata["heads"].unique().numel() == 5
-    return field, samples
+    rays, samples = sampled(field, bundle(*random_rays(plan, 60, seed=8)))
+    assert samples.heads.unique().numel() == 5
+    return field, (rays, samples)
 
 
 def colors(field, samples):
     with torch.no_grad():
-        return field.get_outputs(samples)[FieldHeadNames.RGB]
+        return field.get_outputs(*samples)
 
 
 def in_float64(field, samples):
     """By the lookup and the networks of training."""
     field._packed = {}  # made anew in float64
-    exact, given = copy.deepcopy(field).double(), copy.deepcopy(samples)
-    frustums, meta = given.frustums, given.metadata
-    frustums.directions, meta["ndc"] = frustums.directions.double(), meta["ndc"].double()
-    return exact.get_outputs(given)[FieldHeadNames.RGB].detach()
+    exact, (rays, merged) = copy.deepcopy(field).double(), copy.deepcopy(samples)
+    rays.directions = rays.directions.double()
+    return exact.get_outputs(rays, dataclasses.replace(merged, ndc=merged.ndc.double())).detach()
 
 
 @pytest.mark.parametrize(("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (17, 64, (4, 1))])
 def test_colours_are_those_of_the_networks(channels, width, octaves):
     field, samples = shaded(channels, width, octaves)
-    wanted, valid = in_float64(field, samples), samples.metadata["valid"][..., 0]
-    assert dispatch.form_of("shade", field.features.data, samples.metadata["ndc"]) == "cpu"
+    wanted, valid = in_float64(field, samples), samples[1].valid
+    assert dispatch.form_of("shade", field.features.data, samples[1].ndc) == "cpu"
     assert wanted[valid].std() > 0.05
     for route in ("native", "torch"):
         with dispatch.chosen(route):
@@ -73,7 +70,7 @@ def test_colours_do_not_depend_on_the_number_of_threads():
 def test_colours_say_where_a_feature_is_not_a_number():
     field, samples = shaded()
     before = colors(field, samples).isnan().any(-1)
-    read = field._lookup(samples)
+    read = field._lookup(*samples)
     field.features.data[read.rows[read.taps[0].positions[3, 0]], 5] = math.nan
     found = colors(field, samples).isnan().any(-1)
     assert not before.any() and found.reshape(-1)[read.index[3]] and not found.all()
@@ -98,8 +95,8 @@ def test_arrays_of_a_wrong_shape_are_refused(change):
         "table": field.features.data,
         "networks": SampleNetworks(layers, 2, 2),
         "axes": torch.eye(3).expand(5, 3, 3),
-        "directions": samples.frustums.directions[:, 0],
-        "places": places_of(samples),
+        "directions": samples[0].directions,
+        "places": samples[1].places,
     }
     shade(**given)
     with pytest.raises(ValueError, match="where"):

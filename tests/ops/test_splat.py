@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mmpi_ns.ops.splat import Gaussians, View, splat_image, splat_opacities, splat_sums
+from mmpi_ns.ops.splat import Gaussians, View, splat_errors, splat_image
 
 VIEW = View(
     torch.eye(4)[:3] + torch.tensor([[0, 0, 0, 0.3], [0, 0, 0, -0.2], [0, 0, 0, 1.0]]),
@@ -70,7 +70,8 @@ def test_agrees_with_the_hand_made_renderer(seed):
     image = splat_image(gaussians, VIEW, colors).numpy()
     np.testing.assert_allclose(image, expected, atol=5e-3)  # an alpha at its least to the last bit may count or not
     errors = torch.randn(*expected.shape[:2], 3, generator=torch.Generator().manual_seed(seed))
-    sums = splat_sums(gaussians, VIEW, errors).numpy()
+    shown = torch.from_numpy(image[..., :3])
+    sums = splat_errors(gaussians, VIEW, colors, shown, errors).numpy()
     np.testing.assert_allclose(sums[:, :3], np.einsum("hwn,hwc->nc", weights, errors.numpy()), atol=0.03)
     np.testing.assert_allclose(sums[:, 3], weights.sum((0, 1)), atol=0.03)
 
@@ -99,7 +100,7 @@ def test_opacities_agree_with_finite_differences():
     parts = slopes * errors[..., None] / np.maximum(np.abs(slopes).sum(-1, keepdims=True), 1e-6)
     expected = np.stack([parts.sum((0, 1, 2)), np.abs(slopes).sum((0, 1, 2))], -1)
     given = (torch.tensor(x, dtype=torch.float32) for x in (by_logits(logits), errors))
-    found = splat_opacities(gaussians, VIEW, colors, *given).numpy()
+    found = splat_errors(gaussians, VIEW, colors, *given)[:, 4:].numpy()
     assert (expected[:, 1] > 0.1).sum() > 4
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.02)
 
@@ -111,6 +112,6 @@ def test_arrays_of_a_wrong_shape_are_refused(wrong):
     tensors = [colors, image, image]
     tensors[wrong] = tensors[wrong][:-1]
     with pytest.raises(ValueError, match="has the shape"):
-        splat_opacities(gaussians, VIEW, *tensors)
+        splat_errors(gaussians, VIEW, *tensors)
     with pytest.raises(ValueError, match="has the shape"):
         splat_image(gaussians._replace(alphas=gaussians.alphas[1:]), VIEW, colors)

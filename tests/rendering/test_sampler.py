@@ -13,7 +13,8 @@ from random_fields import bundle, compare, fill, random_field, random_rays, rend
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.rendering.rendered import render_rays
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 
@@ -65,8 +66,8 @@ def test_samples_of_two_identical_mpis_tie_and_the_first_mpi_comes_first(blends)
     field = fill(MMPIField(ScenePlan(twin, None, 0.05, 1.0), feature_channels=5, hidden_width=6), seed=1)
     assert compare(field, *random_rays(field.plan, 10, seed=3), blends) >= 8
     samples = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), blends=blends).samples
-    assert samples.metadata["heads"][0, :, 0].tolist() == [0, 1] * 9
-    assert (samples.metadata["inverse_t"][0, ::2] == samples.metadata["inverse_t"][0, 1::2]).all()
+    assert samples.heads[0].tolist() == [0, 1] * 9
+    assert (samples.inverse_t[0, ::2] == samples.inverse_t[0, 1::2]).all()
 
 
 @pytest.mark.parametrize("blends", [True, False])
@@ -75,13 +76,13 @@ def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(thresho
     field = random_field(4, True, seed=10, planes=40)
     rays = bundle(*random_rays(field.plan, 64, seed=11))
     whole, part = render(field, rays, 0.0, blends), render(field, rays, threshold, blends)
-    dropped = part.report.dropped_mass
+    dropped = part.samples.dropped_mass
     assert ((part.rgb - whole.rgb).abs() <= dropped + 1e-5).all()
     assert ((part.composite.accumulation - whole.composite.accumulation).abs() <= 1e-5).all()
-    assert (dropped > 1e-4).any() and whole.report.dropped_mass.max() == 0
-    assert torch.equal(part.report.live, whole.report.live)
-    kept = part.samples.metadata["valid"].sum()
-    assert kept < whole.samples.metadata["valid"].sum() and kept > 0
+    assert (dropped > 1e-4).any() and whole.samples.dropped_mass.max() == 0
+    assert torch.equal(part.samples.live, whole.samples.live)
+    kept = part.samples.valid.sum()
+    assert kept < whole.samples.valid.sum() and kept > 0
     missing = whole.composite.weights.sum(-1) - part.composite.weights.sum(-1)
     assert torch.allclose(missing, dropped[:, 0], atol=2e-5)
 
@@ -89,7 +90,7 @@ def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(thresho
 def test_with_a_fair_share_nothing_is_dropped_at_the_start_where_all_weights_are_equal():
     plan = ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)
     found = render(MMPIField(plan).eval(), bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=0.5, fair_share=0.1)
-    assert found.samples.shape == (1, 64) and found.samples.metadata["valid"].all()
+    assert found.samples.valid.shape == (1, 64) and found.samples.valid.all()
     assert torch.allclose(found.composite.weights, torch.tensor(1 / 64), rtol=0.01)
 
 
@@ -101,12 +102,12 @@ def test_rays_that_meet_nothing_are_empty(plan, blends):
     for directions in ([backwards], [backwards, forwards], np.zeros((0, 3))):
         found = render(field, bundle(np.zeros((len(directions), 3)), directions), blends=blends)
         count = len(directions)
-        assert found.rgb.shape == (count, 3) and found.samples.shape[0] == count
+        assert found.rgb.shape == (count, 3) and len(found.samples.valid) == count
         assert torch.isfinite(found.rgb).all()
         if count:
             assert (found.rgb[0] == 0).all() and found.composite.transmittance[0] == 1
-            assert found.report.live[0] == 0 and not found.report.explained[0]
-            assert not found.samples.metadata["valid"][0].any()
+            assert found.samples.live[0] == 0 and not found.samples.explained[0]
+            assert not found.samples.valid[0].any()
         if count == 2:
             assert found.composite.transmittance[1] < 0.5
 
@@ -116,8 +117,8 @@ def test_samples_lie_between_near_and_far(near, far):
     field = random_field(4, True, seed=12)
     origins, directions = random_rays(field.plan, 12, seed=13)
     assert compare(field, origins, directions, True, near=near, far=far) >= 4
-    meta = render(field, bundle(origins, directions, near, far)).samples.metadata
-    t = 1 / meta["inverse_t"][meta["valid"]]
+    samples = render(field, bundle(origins, directions, near, far)).samples
+    t = 1 / samples.inverse_t[samples.valid]
     assert t.min() >= near * (1 - 1e-5) and t.max() <= far * (1 + 1e-5)
 
 
@@ -126,15 +127,14 @@ def test_the_plane_at_infinity_is_sampled_where_the_ray_points_and_not_where_it_
     direction = unit([0.3, -0.2, 1.0])
     origins = np.array([[0, 0, 0], [0.2, 0.1, 500.0]])
     found = render(field, bundle(origins, [direction, direction]))
-    last = [int(v.sum()) - 1 for v in found.samples.metadata["valid"]]
+    last = [int(v.sum()) - 1 for v in found.samples.valid]
     assert last[1] == 0, "beyond all finite planes only infinity is left"
     for i in range(2):
-        assert found.samples.metadata["planes"][i, last[i]] == 8
-        assert found.samples.metadata["inverse_t"][i, last[i]] == 0
-        assert found.samples.metadata["ndc"][i, last[i]].tolist() == pytest.approx([0.3, -0.4, 1.0], abs=1e-6)
-        assert found.samples.frustums.starts[i, last[i]] == pytest.approx(1e10)
+        assert found.samples.planes[i, last[i]] == 8
+        assert found.samples.inverse_t[i, last[i]] == 0
+        assert found.samples.ndc[i, last[i]].tolist() == pytest.approx([0.3, -0.4, 1.0], abs=1e-6)
     assert torch.isfinite(found.rgb).all() and found.composite.weights[1, 0] > 0
-    assert render(field, bundle(origins, [direction, direction], far=1e6)).report.live.tolist() == [8, 0]
+    assert render(field, bundle(origins, [direction, direction], far=1e6)).samples.live.tolist() == [8, 0]
 
 
 @pytest.mark.parametrize("blends", [True, False])
@@ -145,21 +145,21 @@ def test_a_ray_does_not_depend_on_its_batch(blends, threshold):
     order = np.random.default_rng(0).permutation(60)
     whole = render(field, bundle(origins, directions), threshold, blends)
     shuffled = render(field, bundle(origins[order], directions[order]), threshold, blends)
-    assert torch.equal(whole.report.live[order], shuffled.report.live)
+    assert torch.equal(whole.samples.live[order], shuffled.samples.live)
     assert torch.allclose(whole.rgb[order], shuffled.rgb, atol=1e-6)
     for size in (1, 7, 59):
         parts = [render(field, bundle(origins[i : i + size], directions[i : i + size]), threshold, blends)
                  for i in range(0, 60, size)]  # fmt: skip
         assert torch.allclose(whole.rgb, torch.cat([p.rgb for p in parts]), atol=1e-6)
-        dropped = torch.cat([p.report.dropped_mass for p in parts])
-        assert torch.allclose(whole.report.dropped_mass, dropped, atol=1e-6)
+        dropped = torch.cat([p.samples.dropped_mass for p in parts])
+        assert torch.allclose(whole.samples.dropped_mass, dropped, atol=1e-6)
 
 
 def ray_explained(plan, origin, direction, alone=True):
     """Alone: all heads of the plan, asked as one of several groups of heads that train apart."""
     mask = torch.ones(1, plan.num_heads, dtype=torch.bool) if alone else None
     rays = bundle([origin], [unit(direction)])
-    return bool(render(MMPIField(plan).eval(), rays, head_mask=mask).report.explained)
+    return bool(render(MMPIField(plan).eval(), rays, head_mask=mask).samples.explained)
 
 
 def test_a_ray_is_explained_when_it_enters_before_the_first_content_and_stays_to_infinity():
@@ -215,28 +215,17 @@ def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
 def test_ray_samples_hold_what_the_field_needs():
     field = random_field(4, True, seed=18)
     found = render(field, bundle(*random_rays(field.plan, 9, seed=19)), blends=True).samples
-    width, valid = found.shape[1], found.metadata["valid"]
-    assert found.shape == (9, width) and width == valid.sum(1).max()
-    shapes = {name: tuple(value.shape) for name, value in found.metadata.items()}
-    assert shapes.pop("ndc") == (9, width, 3)
-    assert set(shapes) == {"heads", "planes", "inverse_t", "valid", "skipped_before", "tau"}
-    assert set(shapes.values()) == {(9, width, 1)} and valid.dtype == torch.bool
-    assert (valid[:, :-1] | ~valid[:, 1:]).all(), "samples are packed to the left"
-    inverse_t = found.metadata["inverse_t"]
+    valid, inverse_t = found.valid, found.inverse_t
+    rays, width = valid.shape
+    assert rays == 9 and width == valid.sum(1).max() and found.ndc.shape == (9, width, 3)
+    for name in ("heads", "planes", "inverse_t", "skipped_before", "tau"):
+        assert getattr(found, name).shape == valid.shape
+    assert valid.dtype == torch.bool and (valid[:, :-1] | ~valid[:, 1:]).all(), "samples are packed to the left"
     assert (inverse_t[:, :-1] >= inverse_t[:, 1:]).all() and (inverse_t[~valid] == 0).all()
-    frustums = found.frustums
-    assert torch.equal(frustums.starts, frustums.ends) and frustums.starts.shape == (9, width, 1)
-    finite = valid & (inverse_t > 0)
-    assert torch.allclose(frustums.starts[finite], 1 / inverse_t[finite])
-    assert frustums.origins.shape == frustums.directions.shape == (9, width, 3)
-    assert frustums.pixel_area.shape == (9, width, 1)
-    assert (found.metadata["ndc"][valid[..., 0]].abs() <= 1 + 1e-5).all()
+    assert (found.ndc[valid].abs() <= 1 + 1e-5).all()
 
 
 def test_the_sampler_builds_no_graph():
     field = random_field(2, True, seed=20).train()
-    samples, report = MMPISampler()(
-        bundle(*random_rays(field.plan, 4, seed=21)), field=field, threshold=0.0, blends=True
-    )
-    tensors = [*samples.metadata.values(), report.skipped_total, report.dropped_mass]
-    assert not any(t.requires_grad for t in tensors)
+    samples = render_rays(bundle(*random_rays(field.plan, 4, seed=21)), field, MarchOptions(0.0, blends=True)).samples
+    assert not any(t.requires_grad for t in vars(samples).values() if isinstance(t, torch.Tensor))

@@ -7,15 +7,13 @@ import oracle
 import pytest
 import torch
 from bricked import SHAPES, big_plan, bricked_field, chance, layout_of, thinned
-from nerfstudio.field_components.field_heads import FieldHeadNames
-from random_fields import bundle, compare, random_rays, render
+from random_fields import bundle, compare, random_rays, render, sampled
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import ENOUGH_CROSSINGS, RELEASED_DENSITY, TABLES
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate_densely, texel_rows
 from mmpi_ns.ops.variation import total_variation
-from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.bricks import (
     grown_tiles,
     new_table,
@@ -122,19 +120,19 @@ def test_the_march_leaves_out_what_holds_nothing_and_keeps_the_rest(monkeypatch,
         monkeypatch.setattr(dispatch, "_chosen", route)
         found.append(render(field, rays, 1e-3, blends))
     fast, plain = found
-    same = (fast.samples.metadata["valid"].sum(1) == plain.samples.metadata["valid"].sum(1))[:, 0]
+    same = fast.samples.valid.sum(1) == plain.samples.valid.sum(1)
     assert same.float().mean() > 0.97
     assert (fast.rgb - plain.rgb).abs()[same].max() < 3e-5
     assert (fast.composite.transmittance - plain.composite.transmittance).abs().max() < 1.2e-5
-    assert torch.equal(fast.report.live, plain.report.live)
+    assert torch.equal(fast.samples.live, plain.samples.live)
 
 
 def test_colours_without_gradients_equal_those_with():
     field = bricked_field().eval()
-    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 60, seed=8)), field=field, threshold=0.0)
+    samples = sampled(field, bundle(*random_rays(field.plan, 60, seed=8)))
     with torch.no_grad():
-        fast = field.get_outputs(samples)[FieldHeadNames.RGB]
-    plain = field.get_outputs(samples, field.get_density(samples)[1])[FieldHeadNames.RGB]
+        fast = field.get_outputs(*samples)
+    plain = field.get_outputs(*samples, field.get_density(*samples)[1])
     assert plain.std() > 0.05 and (fast - plain).abs().max() < 1e-5
 
 
@@ -169,12 +167,12 @@ def train(field, steps=4, blends=False):
     read = 0
     for step in range(steps):
         rays = bundle(*random_rays(field.plan, 60, seed=step))
-        samples, _ = MMPISampler()(rays, field=field, threshold=0.0)
-        tau, lookup = field.get_density(samples)
+        samples = sampled(field, rays)
+        tau, lookup = field.get_density(*samples)
         read += sum(int((lookup.rows[taps.positions] < BRICK).sum()) for taps in lookup.taps)
-        rgb = field.get_outputs(samples, lookup)[FieldHeadNames.RGB]
-        loss = (rgb * torch.tanh(tau)).sum() + field.total_variation(lookup, 1.0, 1.0)
-        loss = loss + field.sample_shares(samples, lookup)[0].square().sum()
+        rgb = field.get_outputs(*samples, lookup)
+        loss = (rgb * torch.tanh(tau)[..., None]).sum() + field.total_variation(lookup, 1.0, 1.0)
+        loss = loss + field.sample_shares(*samples, lookup)[0].square().sum()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -266,10 +264,10 @@ def test_growth_stores_only_what_training_rays_reach():
 def used(field, rays, least):
     """Notes what rays see, and releases."""
     field.look_afresh()
-    samples, report = MMPISampler()(rays, field=field, threshold=0.0)
-    _, lookup = field.get_density(samples)
+    _, samples = sampled(field, rays)
+    _, lookup = field.get_density(rays, samples)
     weights = render(field, rays).composite.weights
-    field.note_use(lookup, weights, report.live, weights.new_ones(len(weights)))
+    field.note_use(lookup, weights, samples.live, weights.new_ones(len(weights)))
     return weights, field.release_unused(least)
 
 
@@ -280,7 +278,7 @@ def test_a_release_changes_images_by_no_more_than_what_it_gives_up():
     weights, kept = used(field, rays, least := 0.02)
     assert kept is not None and 0.1 * bricks < field.num_bricks < 0.9 * bricks
     after = render(field, rays)
-    assert torch.equal(before.report.live, after.report.live)
+    assert torch.equal(before.samples.live, after.samples.live)
     # Only samples that weigh less than the bound get thinner, so what they weighed is all that others can gain.
     given_up = torch.where(weights < least, weights, 0.0).sum(-1)
     change = (after.rgb - before.rgb).abs().amax(-1)

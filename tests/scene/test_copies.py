@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 from bricked import big_plan, bricked_field, chance
-from random_fields import bundle, compare, random_rays, render
+from random_fields import bundle, compare, random_rays, render, sampled
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import RELEASED_DENSITY
 from mmpi_ns.ops import dispatch
-from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.bricks import tiles_with_copies
 from mmpi_ns.scene.texels import BRICK
 
@@ -95,12 +94,12 @@ def test_a_state_with_copies_comes_back_and_one_from_before_there_were_any_is_re
 
 def test_the_gain_of_a_brick_is_what_its_samples_weigh_times_the_errors_of_their_rays():
     field = bricked_field()
-    samples, report = MMPISampler()(bundle(*random_rays(field.plan, 40, seed=1)), field=field, threshold=0.0)
-    _, lookup = field.get_density(samples)
-    shape = samples.metadata["valid"].shape[:2]
+    rays, samples = sampled(field, bundle(*random_rays(field.plan, 40, seed=1)))
+    _, lookup = field.get_density(rays, samples)
+    shape = samples.valid.shape
     weights, errors = torch.rand(shape), torch.rand(shape[0])
     field.look_afresh()
-    field.note_use(lookup, weights, report.live, errors)
+    field.note_use(lookup, weights, samples.live, errors)
     gain = np.zeros(field.num_bricks + 1)
     firsts = torch.cat([lookup.rows[taps.positions[:, 0]] for taps in lookup.taps])
     for slot, row in zip(lookup.index.tolist(), firsts.tolist(), strict=True):

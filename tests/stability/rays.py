@@ -172,7 +172,7 @@ def gradients_of(field: MMPIField, found: RenderedRays, by: Array) -> dict[str, 
     texels = torch.cat([grid.rows for grid in field.grids])
     tables = {name: field.networks.weights if name == "networks" else getattr(field, name) for name in TABLES}
     field.zero_grad()
-    found.colors.rgb.backward(float32(by).to(field.density.device))
+    found.rgb.backward(float32(by).to(field.density.device))
     read = {name: table for name, table in tables.items() if table.grad is not None}
     return {n: as_array(dense_grad(t)[texels] if isinstance(t, Table) else t.grad) for n, t in read.items()}
 
@@ -197,7 +197,7 @@ def measure(make: Callable[[], Scene], precision: Precision) -> Outcome:
         moved, _ = slopes_of(rays, by, s.blends)
         for name in gradients:
             moved_slope[name] = max(moved_slope[name], float(np.abs(moved[name] - slopes[name]).max()))
-    off = np.abs(as_array(found.colors.rgb) - wanted).max(-1)
+    off = np.abs(as_array(found.rgb) - wanted).max(-1)
     errors = [Error(float(a), 2 * float(b) + 16 * UNIT) for a, b in zip(off, moved_color, strict=True)]
     by_table = []
     for name, gradient in gradients.items():
@@ -218,7 +218,7 @@ def _chunks(threshold: float, precision: Precision) -> Outcome:
 
         def go(rows: Array) -> list[Array]:
             made = s.render(threshold, rows)
-            return [as_array(made.colors.rgb), as_array(made.composite.transmittance)]
+            return [as_array(made.rgb), as_array(made.composite.transmittance)]
 
         whole = go(np.arange(count))
         ways = [(order, [order])]
@@ -236,8 +236,8 @@ def _threshold(threshold: float, precision: Precision) -> Outcome:
     s = scene(4, 100, True, 17, log_depths=(-3, 1.0))
     with torch.no_grad(), precision.context():
         whole, part = (s.render(t) for t in (0.0, threshold))
-    dropped = as_array(part.report.dropped_mass)
-    excess = np.maximum(np.abs(as_array(part.colors.rgb - whole.colors.rgb)) - dropped, 0)
+    dropped = as_array(part.samples.dropped_mass)
+    excess = np.maximum(np.abs(as_array(part.rgb - whole.rgb)) - dropped, 0)
     # Optical depth that both gather differs by what lies behind 1e-4 of the light or is thinner than 1e-4.
     error = Error(float(excess.max()), 64 * precision.network_unit + 2e-4)
     return Outcome.of([error], wrong=int(dropped.max() <= 0))
@@ -253,7 +253,7 @@ def _nothing(precision: Precision) -> Outcome:
     for count in (1, 2, 0):
         with precision.context():
             found = s.render(rows=slice(count))
-        first, rgb = min(1, count), found.colors.rgb
+        first, rgb = min(1, count), found.rgb
         errors.append(compare(rgb[:first], np.zeros((first, 3)), 1.0, 0))
         errors.append(compare(found.composite.transmittance[:first], np.ones((first, 1)), 1.0, 0))
         errors.append(Error(float((~torch.isfinite(rgb)).sum()), 0.0))

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from nerfstudio.field_components.field_heads import FieldHeadNames
 from random_fields import random_plan
 from training_runs import datamanager, plan_of, ready, trainer_config
 
@@ -56,10 +55,10 @@ def test_photometric_is_the_mean_squared_error():
 def point_color(colors, weights, observed):
     """The loss from samples, through the sums that a ray keeps of them."""
     field = MMPIField(random_plan(1, False, 0), shading="sample")
-    field.get_outputs = lambda *_: {FieldHeadNames.RGB: colors}
+    field.get_outputs = lambda *_: colors
     composite = Composite(weights, weights[:, :1], weights[:, :1])
-    rays = field.render_colors(None, None, composite)
-    return losses.point_color(rays.mass, rays.first, rays.second, observed)
+    _, sums = field.render_colors(None, None, None, composite)
+    return losses.point_color(sums.mass, sums.first, sums.second, observed)
 
 
 def test_point_color_weighs_each_samples_error_by_its_weight():
@@ -307,7 +306,7 @@ def test_opaque_pixels_with_alpha_train_as_pixels_without(scene, tmp_path):
     model.train()
     rays, batch = manager.next_train(0)
     outputs = model.get_outputs(rays)
-    assert 0 < outputs["training"].report.explained.float().mean() < 1
+    assert 0 < outputs["training"].samples.explained.float().mean() < 1
     alpha = {**batch, "image": torch.cat([batch["image"], torch.ones(len(batch["image"]), 1)], -1)}
     plain, opaque = (model.get_loss_dict(outputs, b) for b in (batch, alpha))
     assert plain["rgb_loss"].item() == opaque["rgb_loss"].item() > 0

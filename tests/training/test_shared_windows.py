@@ -14,7 +14,6 @@ from training_runs import WINDOW_STEPS as STEPS
 from training_runs import differences, load, rendered, trainer_config
 
 from mmpi_ns.field.tables import in_half_precision
-from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.details import DETAILS_FOLDER, read_details
 
 
@@ -70,8 +69,8 @@ def test_what_two_processes_trained_is_evaluated_as_any_run(whole, shared):
     field = whole.pipeline.model.field
     trained = {name: x.clone() for name, x in field.state_dict().items()}
     field.load_state_dict(in_half_precision(trained))  # as the last checkpoint has it
-    with exact_images():
-        colors, expected = (rendered(p.model, origins)["rgb"] for p in (pipeline, whole.pipeline))
+    pipeline.model.config.rendering.mode = "exact"
+    colors, expected = (rendered(p.model, origins)["rgb"] for p in (pipeline, whole.pipeline))
     field.load_state_dict(trained)
     assert torch.equal(colors, expected)
 

@@ -13,7 +13,6 @@ from training_runs import WINDOW_STEPS as STEPS
 from training_runs import compared, differences, facing, load, ready, rendered, trainer_config
 
 from mmpi_ns.field.tables import TABLES, in_half_precision
-from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.windows import WindowedPlan, window_shares
 from mmpi_ns.training.initial import start_from_depths
@@ -132,8 +131,8 @@ def test_evaluation_reads_the_windows_back(whole):
     origins = torch.stack([torch.tensor(w.center).float() for w in model.progress.windows.windows])
     state = {name: x.clone() for name, x in model.field.state_dict().items()}
     model.field.load_state_dict(in_half_precision(state))  # as the last checkpoint has it
-    with exact_images():
-        a, b = rendered(model, origins), rendered(pipeline.model, origins)
+    pipeline.model.config.rendering.mode = "exact"
+    a, b = rendered(model, origins), rendered(pipeline.model, origins)
     model.field.load_state_dict(state)
     for name in ("rgb", "depth", "winning_mpi"):
         assert torch.equal(a[name], b[name]), name

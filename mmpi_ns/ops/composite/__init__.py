@@ -6,9 +6,7 @@ log(1 - alpha), while tau is an ordinary number. All arithmetic is float32 or wi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -39,7 +37,7 @@ class Composite:
     """What passes the whole ray."""
 
 
-@operation("gpu")
+@operation()
 def composite_weights(
     tau: Float[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
@@ -67,14 +65,11 @@ def composite_weights(
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
 
 
-class _Compiled(torch.autograd.Function):
+class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, run: Callable[..., None], tau: Tensor, valid: Tensor, before: Tensor, total: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
         weights, depth = torch.empty_like(tau), torch.empty_like(total)
-        run("mmpi_composite", *tau.shape, tau, valid, before, total, weights, depth)
-        ctx.run = run
+        call_in_parts("mmpi_composite", *tau.shape, tau, valid, before, total, weights, depth)
         ctx.save_for_backward(tau, valid, before, weights)
         return weights, depth
 
@@ -82,21 +77,14 @@ class _Compiled(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         tau, *_ = saved = ctx.saved_tensors
         grad = torch.empty_like(tau)
-        ctx.run("mmpi_composite_back", *tau.shape, *saved, *(g.contiguous() for g in grad_outputs), grad)
-        return None, grad, None, None, None
+        call_in_parts("mmpi_composite_back", *tau.shape, *saved, *(g.contiguous() for g in grad_outputs), grad)
+        return grad, None, None, None
 
 
-def composited(
-    run: Callable[..., None], tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor
-) -> Composite:
-    """``composite_weights`` by a compiled form.
-
-    Args:
-        run: calls the function "mmpi_composite" or "mmpi_composite_back" of numbers of rays and slots, and tensors.
-        tau, valid, skipped_before, skipped_total: arguments of ``composite_weights``.
-    """
+@composite_weights.on_cpu
+def composite_weights_on_cpu(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
     tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(skipped_before, skipped_total))
-    weights, depth = _Compiled.apply(run, *tensors)  # type: ignore[misc]
+    weights, depth = _Composite.apply(*tensors)  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
 
 
@@ -131,6 +119,3 @@ def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_
     """The head that gives each ray most of its weight, as nerfstudio's images take it; the first of equals."""
     mass = weights.new_zeros(len(weights), num_heads).scatter_add(1, heads, weights)
     return mass.argmax(-1, keepdim=True).to(weights.dtype)
-
-
-composite_weights.on_cpu(partial(composited, call_in_parts))

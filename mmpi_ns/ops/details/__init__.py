@@ -10,19 +10,14 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from mmpi_ns.ops.build import HEADERS
-from mmpi_ns.ops.dispatch import in_cpp, operation
+from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import numbers_in
 
 TEXT = (HEADERS / "details.h").read_text(encoding="utf-8")
 """Lines that both C++ and GLSL understand: the numbers below with what they mean, and the weights."""
-_NUMBERS = numbers_in(TEXT)
-TURN = _NUMBERS["TURN"]
-FADE = _NUMBERS["FADE"]
-SAME_DEPTH = _NUMBERS["SAME_DEPTH"]
-SAME_PIXELS = _NUMBERS["SAME_PIXELS"]
-STRENGTH = _NUMBERS["STRENGTH"]
-LEAST_WEIGHT = _NUMBERS["LEAST_WEIGHT"]
-TINY = _NUMBERS["TINY"]
+TURN, FADE, SAME_DEPTH, SAME_PIXELS, STRENGTH, LEAST_WEIGHT, TINY = numbers_in(
+    TEXT, "TURN", "FADE", "SAME_DEPTH", "SAME_PIXELS", "STRENGTH", "LEAST_WEIGHT", "TINY"
+)
 
 
 class SeenDetails(NamedTuple):
@@ -59,7 +54,7 @@ def project(
     return torch.stack([column, row], -1), inside
 
 
-@operation()
+@operation(in_cpp=256)
 def seen_details(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
@@ -95,6 +90,3 @@ def seen_details(
     agrees = torch.exp(-((there - here) / margin).square().clamp(max=80)) / (turn + TURN)
     faded = values[:, :3] / (1 + (turn / FADE).square())
     return SeenDetails(faded, torch.where(inside[:, None] & (there >= 0), agrees, 0.0))
-
-
-in_cpp(seen_details, least=256)

@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops.gather import COLORS, RaySums, Taps, split_sums
-from mmpi_ns.ops.gpu_scene import block_size, launch, read_taps
+from mmpi_ns.ops.gpu_scene import block_size, launch
 
 NUMBERS = 512
 """Rays, or samples, of a program, times their channels: what its registers hold."""
@@ -24,6 +24,18 @@ def activate(raw, column):
     """Colours and features of samples."""
     share = 1 / (1 + tl.exp(-tl.where(column < 3, raw, 2 * raw)))
     return tl.where(column < 3, share, 2 * share - 1)
+
+
+@triton.jit
+def _read_taps(values, positions, shares, number, inside, channels, column, TAPS: tl.constexpr):
+    """Sums over taps of share times row of a table."""
+    raw = number[:, None] * column * 0.0
+    for tap in tl.static_range(TAPS):
+        row = tl.load(positions + number * TAPS + tap, inside, 0).to(tl.int64)
+        share = tl.load(shares + number * TAPS + tap, inside, 0.0)
+        read = tl.load(values + row[:, None] * channels + column, inside[:, None] & (column < channels), 0.0)
+        raw += share[:, None] * read
+    return raw
 
 
 # Arrays that are parts of others begin anywhere, and no variant is compiled for those that happen to be aligned.
@@ -45,9 +57,9 @@ def gather_kernel(
         slot = ray.to(tl.int64) * slots + s
         number = tl.load(numbers + slot, inside, -1)
         on_plane, in_cube = (number >= 0) & (number < planar), number >= planar
-        raw = read_taps(values, positions, shares, number, on_plane, channels, column, 4)
+        raw = _read_taps(values, positions, shares, number, on_plane, channels, column, 4)
         if HAS_CUBE:
-            raw += read_taps(values, cube_positions, cube_shares, number - planar, in_cube, channels, column, 8)
+            raw += _read_taps(values, cube_positions, cube_shares, number - planar, in_cube, channels, column, 8)
         weight = tl.load(weights + slot, number >= 0, 0.0)
         value = weight[:, None] * activate(raw, column)
         total += value
@@ -74,7 +86,7 @@ def gather_back_kernel(
     slot = tl.load(slots + first + number, inside, 0)
     ray = slot // slots_per_ray
     inside = inside & (tl.load(chosen + ray, inside, 0) != 0)
-    value = activate(read_taps(values, positions, shares, number, inside, channels, column, TAPS), column)
+    value = activate(_read_taps(values, positions, shares, number, inside, channels, column, TAPS), column)
     filled, is_color = inside[:, None] & (column < channels), inside[:, None] & (column < 3)
     slope = tl.load(to_sums + ray[:, None] * channels + column, filled, 0.0)
     tl.store(to_weights + slot, tl.sum(slope * value, 1), inside)

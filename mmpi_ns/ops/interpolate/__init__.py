@@ -6,17 +6,22 @@ A table has millions of rows of which a step reads a few: backward and optimiser
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor, nn
 
 from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds
-from mmpi_ns.ops.dispatch import in_cpp, operation
+from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
+
+MOST_ROWS = 2**31
+"""A bit is taken for every row of the table: beyond this, torch's sort."""
+AT_LEAST = 1 << 15
+"""Entries, samples or bricks that are worth another thread, whose start takes as long as a tenth of a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -27,18 +32,6 @@ class RowIndex:
     """Rising, except for padding."""
     positions: Int[Tensor, "..."]
     """Of every entry in ``unique``; int32 or int64."""
-
-
-class HeadSamples(NamedTuple):
-    """The valid samples of a batch: heads rising, and the slots of each head."""
-
-    slots: Int[Tensor, "N"]
-    """Flat slots [R, S] of the samples."""
-    heads: Int[Tensor, "N"]
-    planes: Int[Tensor, "N"]
-    ndc: Float[Tensor, "N 3"]
-    counts: Sequence[int]
-    """Samples of each head."""
 
 
 class Table(nn.Parameter):
@@ -73,13 +66,18 @@ class Table(nn.Parameter):
 
 
 @operation()
-def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
+def order_by_head(
+    places: Places, num_heads: int, counts: Sequence[int] | None = None
+) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "N"], Float[Tensor, "N 3"], Sequence[int]]:
     """Valid samples of a batch, ordered by head and otherwise by slot.
 
     Args:
         places: of the samples.
         num_heads: of the scene.
         counts: samples of each head, if known; otherwise this synchronises with a GPU.
+
+    Returns:
+        Flat slots [R, S] of the samples, their heads, planes and NDC, and how many there are of each head.
     """
     heads, valid = places.heads.reshape(-1), places.valid.reshape(-1)
     if counts is None:
@@ -89,10 +87,10 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None =
         keys = torch.where(valid, heads, num_heads)
         slots = torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)]
     planes, ndc = places.planes.reshape(-1)[slots], places.ndc.reshape(-1, 3)[slots]
-    return HeadSamples(slots, heads[slots], planes, ndc, counts)
+    return slots, heads[slots], planes, ndc, counts
 
 
-@operation("gpu")
+@operation()
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
@@ -105,14 +103,15 @@ def texel_rows(
         planes: plane of each sample.
         ndc: position of each sample in its MPI.
     """
-    rows, weights = planes.new_zeros(len(heads), 4), ndc.new_zeros(len(heads), 4)
-    for k, grid in enumerate(layout.grids[: len(layout.mpis)]):
-        here = (heads == k).nonzero()[:, 0]
-        rows[here], weights[here] = grid.bilinear(planes[here], ndc[here])
-    return rows, weights
+    names = ("height", "width", "down", "across", "first_tile")
+    sizes = layout.once(
+        "sizes", lambda it: torch.tensor([[getattr(g, name) for name in names] for g in it.grids], device=heads.device)
+    )
+    of_samples: dict[str, Any] = dict(zip(names, sizes[heads].unbind(-1), strict=True))
+    return replace(layout.grids[0], **of_samples).bilinear(planes, ndc)
 
 
-@operation("gpu")
+@operation()
 def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) -> RowIndex:
     """Distinct rows of a list, rising.
 
@@ -122,10 +121,14 @@ def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) ->
         pads: row 0, which no entry refers to there, may follow the distinct rows any number of times. A GPU then
             need not be waited for to tell their number.
     """
-    return RowIndex(*torch.unique(rows, return_inverse=True))
+    listed, order = rows.reshape(-1).sort()
+    place = torch.diff(listed, prepend=listed[:1]).ne(0).cumsum(0)
+    count = len(listed) if pads or not len(listed) else int(place[-1]) + 1
+    unique = torch.zeros_like(listed).index_copy(0, place, listed)[:count]
+    return RowIndex(unique, torch.empty_like(place).index_copy(0, order, place).view(rows.shape))
 
 
-@operation("gpu")
+@operation()
 def sum_rows(
     positions: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"], count: int
 ) -> Float[Tensor, "U C"]:
@@ -144,7 +147,7 @@ def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]
 
 
-@operation()
+@operation(in_cpp=AT_LEAST)
 def take_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     """Values of ``read_rows``."""
     return table.index_select(0, rows)
@@ -157,7 +160,7 @@ def weigh_rows(
     return _WeighRows.apply(values, positions, weights.to(values.dtype))  # type: ignore[no-any-return]
 
 
-@operation("gpu")
+@operation(in_cpp=AT_LEAST)
 def weighted_rows(
     table: Float[Tensor, "T C"], rows: Int32[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
@@ -209,14 +212,8 @@ class _WeighRows(torch.autograd.Function):
         return to_values, None, to_weights
 
 
-MOST_ROWS = 2**31
-"""A bit is taken for every row of the table: beyond this, torch's sort."""
-AT_LEAST = 1 << 15
-"""Entries, samples or bricks that are worth another thread, whose start takes as long as a tenth of a millisecond."""
-
-
 @order_by_head.on_cpu
-def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
+def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> tuple:
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
@@ -227,7 +224,7 @@ def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] |
     slots, of_heads, of_planes = torch.empty(3, count, dtype=torch.int64)
     columns = (slots, of_heads, of_planes, torch.empty(count, 3))
     call_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
-    return HeadSamples(*columns, totals.tolist())
+    return *columns, totals.tolist()
 
 
 @texel_rows.on_cpu
@@ -266,7 +263,3 @@ def sum_rows_on_cpu(positions: Tensor, values: Tensor, weights: Tensor, count: i
     bounds = owned_bounds([positions], count, AT_LEAST)
     call_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
     return sums
-
-
-in_cpp(weighted_rows, AT_LEAST)
-in_cpp(take_rows, AT_LEAST)

@@ -22,7 +22,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.layout import Places, SceneLayout, Tables, dense, dense_fields
+from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 from mmpi_ns.scene.baked import columns_from
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
@@ -89,7 +89,7 @@ def show_rays(
     """
     m = march(layout, tables, rays, options)
     composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)
-    sums = gather_places(layout, features, Places(m.heads, m.planes, m.ndc, m.valid), composite.weights)
+    sums = gather_places(layout, features, m.places, composite.weights)
     return Shown(
         gathered=sums.gathered,
         mass=composite.weights.sum(-1, keepdim=True),

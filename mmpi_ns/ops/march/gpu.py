@@ -9,7 +9,7 @@ where less than 1e-5 of its light is left, and less than a sample must weigh to 
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import triton
@@ -39,8 +39,13 @@ NUMBERS = 256
 
 @triton.jit
 def _store_samples(
-    to, keep, head, plane, u, v, s, inverse_t, tau, skipped, heads, planes, ndc, inverse_ts, taus, skipped_before
-):
+    keep, ray, number_kept, room, head, plane, u, v, s, inverse_t, tau, skipped,
+    heads, planes, ndc, inverse_ts, taus, skipped_before, STEPS: tl.constexpr,
+):  # fmt: skip
+    """Writes samples to keep to the next slots of their rays; which of them there was room for."""
+    slot = number_kept[:, None] + before(keep.to(tl.int32), STEPS)
+    keep = keep & (slot < room)
+    to = ray[:, None].to(tl.int64) * room + slot
     tl.store(heads + to, head, keep)
     tl.store(planes + to, plane, keep)
     tl.store(ndc + 3 * to, u, keep)
@@ -49,6 +54,25 @@ def _store_samples(
     tl.store(inverse_ts + to, inverse_t, keep)
     tl.store(taus + to, tau, keep)
     tl.store(skipped_before + to, skipped, keep)
+    return keep
+
+
+@triton.jit
+def _bounds(samples, threshold, fair_share, KEEP_ALL: tl.constexpr):
+    """Weight that a sample of a ray exceeds to be kept, and light at which the ray ends (``Bounds`` of cpp/walk.h)."""
+    bound = tl.minimum(fair_share / tl.maximum(samples, 1).to(tl.float32), threshold)
+    bound = bound * 0 - 1 if KEEP_ALL else bound
+    return bound, tl.minimum(bound, OPAQUE)
+
+
+@triton.jit
+def _ends(left, met, light, depth, end_of_light, STEPS: tl.constexpr):
+    """How many samples rays go on to after a chunk, and the light left where one ends early, which is no less than what
+    all the rest weighs."""
+    unseen = tl.max(tl.where(met & (light <= end_of_light[:, None]), light, -1.0), 1)
+    left = tl.where(unseen >= 0, 0, left - STEPS)  # by rounds, so that no odd number can keep the loop going
+    over = (left > 0) & (tl.exp(-depth) <= end_of_light)
+    return tl.where(over, 0, left), tl.where(unseen >= 0, unseen, tl.where(over, tl.exp(-depth), 0.0))
 
 
 @triton.jit
@@ -60,15 +84,13 @@ def _vectors(vectors, ray):
 
 @triton.jit(do_not_specialize=("num_rays", "room"))
 def march_kernel(
-    origins, directions, nears, fars, allowed, priorities,
-    constants, grids, biases, cube, density, reliability, touched,
-    live, explained, kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before, numbers,
-    num_rays, room, threshold, fair_share, content_near, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
-    ALLOWS: tl.constexpr, CHOOSES: tl.constexpr, BLENDS: tl.constexpr, KEEP_ALL: tl.constexpr, RAYS: tl.constexpr,
-    STEPS: tl.constexpr,
+    origins, directions, nears, fars, allowed, priorities, constants, grids, biases, cube, density, reliability,
+    touched, live, explained, kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before,
+    numbers, num_rays, room, threshold, fair_share, content_near, K: tl.constexpr, HEADS: tl.constexpr,
+    HAS_CUBE: tl.constexpr, ALLOWS: tl.constexpr, CHOOSES: tl.constexpr, BLENDS: tl.constexpr, KEEP_ALL: tl.constexpr,
+    RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    """Marches RAYS rays. What ray r keeps is written from r * room on; how much, to kept[r]. ``numbers``: the most that
-    a ray keeps, then what is kept of each head."""
+    """What ray r keeps is written from r * room on. ``numbers``: the most that a ray keeps, then that of each head."""
     row, head_of = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, HEADS)
     exists = row < num_rays
     ray = tl.where(exists, row, 0)
@@ -83,9 +105,7 @@ def march_kernel(
     tl.store(explained + row, is_explained, exists)
     if not KEEP_ALL:
         done = pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K, HEADS)
-    bound = tl.minimum(fair_share / tl.maximum(left, 1).to(tl.float32), threshold)
-    bound = bound * 0 - 1 if KEEP_ALL else bound
-    end_of_light = tl.minimum(bound, OPAQUE)
+    bound, end_of_light = _bounds(left, threshold, fair_share, KEEP_ALL)
     left -= tl.sum(done, 1)
     number_kept, of_heads, depth, skipped, dropped = left * 0, head_of * 0, bound * 0, bound * 0, bound * 0
     while tl.max(left, 0) > 0:
@@ -96,50 +116,23 @@ def march_kernel(
         light = tl.exp(-(depth[:, None] + before(tau, STEPS)))
         seen, weight = met & (light > end_of_light[:, None]), light * one_minus_exp(tau)
         keep, skip = seen & (weight > bound[:, None]), tl.where(seen & (weight <= bound[:, None]), tau, 0.0)
-        slot = number_kept[:, None] + before(keep.to(tl.int32), STEPS)
-        keep = keep & (slot < room)
-        to, in_front = ray[:, None].to(tl.int64) * room + slot, skipped[:, None] + before(skip, STEPS)
-        _store_samples(to, keep, head, plane, p, q, s, inverse_t, tau, in_front,
-                       heads, planes, ndc, inverse_ts, taus, skipped_before)  # fmt: skip
+        keep = _store_samples(
+            keep, ray, number_kept, room, head, plane, p, q, s, inverse_t, tau, skipped[:, None] + before(skip, STEPS),
+            heads, planes, ndc, inverse_ts, taus, skipped_before, STEPS,
+        )  # fmt: skip
         number_kept += tl.sum(keep.to(tl.int32), 1)
         for k in range(K + HAS_CUBE):
             of_heads += tl.where(head_of == k, tl.sum(tl.sum((keep & (head == k)).to(tl.int32), 1), 0), 0)
         skipped += tl.sum(skip, 1)
         dropped += tl.sum(tl.where(skip > 0, weight, 0.0), 1)
         depth += tl.sum(tl.where(seen, tau, 0.0), 1)
-        # Where a ray ends early, the light left there is no less than what all the rest weighs.
-        unseen = tl.max(tl.where(met & (light <= end_of_light[:, None]), light, -1.0), 1)
-        left = tl.where(unseen >= 0, 0, left - STEPS)  # by rounds, so that no odd number can keep the loop going
-        over = (left > 0) & (tl.exp(-depth) <= end_of_light)
-        dropped += tl.where(unseen >= 0, unseen, tl.where(over, tl.exp(-depth), 0.0))
-        left = tl.where(over, 0, left)
+        left, rest = _ends(left, met, light, depth, end_of_light, STEPS)
+        dropped += rest
     tl.store(kept + row, number_kept, exists)
     tl.store(skipped_total + row, skipped, exists)
     tl.store(dropped_mass + row, dropped, exists)
     tl.atomic_max(numbers, tl.max(number_kept, 0), sem="relaxed")
     tl.atomic_add(numbers + 1 + head_of, of_heads, head_of < K + HAS_CUBE, sem="relaxed")
-
-
-@triton.jit(do_not_specialize=("size", "width", "room"))
-def pack_kernel(
-    kept, heads, planes, ndc, inverse_ts, taus, skipped_before,
-    to_heads, to_planes, to_ndc, to_inverse_ts, to_taus, to_skipped_before, valid,
-    size, width, room, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Copies what the rays kept into ``width`` slots each; the rest of the slots is 0."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    inside = i < size
-    ray, slot = i // width, i % width
-    has = inside & (slot < tl.load(kept + ray, inside, 0))
-    at = ray * room + slot
-    tl.store(valid + i, has, inside)
-    tl.store(to_heads + i, tl.load(heads + at, has, 0).to(tl.int64), inside)
-    tl.store(to_planes + i, tl.load(planes + at, has, 0).to(tl.int64), inside)
-    for a in tl.static_range(3):
-        tl.store(to_ndc + 3 * i + a, tl.load(ndc + 3 * at + a, has, 0.0), inside)
-    tl.store(to_inverse_ts + i, tl.load(inverse_ts + at, has, 0.0), inside)
-    tl.store(to_taus + i, tl.load(taus + at, has, 0.0), inside)
-    tl.store(to_skipped_before + i, tl.load(skipped_before + at, has, 0.0), inside)
 
 
 @triton.jit
@@ -208,15 +201,13 @@ def show_kernel(
     tl.store(medians + ray, median, inside)
 
 
-@dataclass(frozen=True)
-class Slots:
-    """What rays kept, each in ``room`` slots of its own."""
+class Slots(NamedTuple):
+    """What rays kept, each in ``room`` slots of its own, before anything is waited for."""
 
     kept: Int[Tensor, "R"]
     """Number of them; what the other slots hold means nothing."""
-    slots: list[Tensor]
+    samples: list[Tensor]
     """See ``empty_samples``; [R, room] each."""
-    room: int
     skipped_total: Float[Tensor, "R 1"]
     dropped_mass: Float[Tensor, "R 1"]
     live: Int[Tensor, "R"]
@@ -226,41 +217,44 @@ class Slots:
 
 
 def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
-    """``march`` before anything is waited for."""
+    """``march`` up to where its result is packed, or summed."""
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
     threshold, room = float(options.threshold), options.most_kept(layout.most_samples)
     # Where all heads may answer, what stands for the choice is not read.
     parts = [rays.origins if x is None else x for x in dense_fields(rays)]
-    live = torch.empty(num_rays, dtype=torch.int64, device=device)
-    explained = torch.empty(num_rays, 1, dtype=torch.bool, device=device)
-    kept = torch.empty(num_rays, dtype=torch.int32, device=device)
-    skipped, dropped = (torch.empty(num_rays, 1, device=device) for _ in range(2))
-    slots = empty_samples(num_rays, room, index=torch.int32, device=device)
-    numbers = torch.zeros(1 + num_heads, dtype=torch.int32, device=device)
+    m = Slots(
+        kept=torch.empty(num_rays, dtype=torch.int32, device=device),
+        samples=empty_samples(num_rays, room, index=torch.int32, device=device),
+        skipped_total=torch.empty(num_rays, 1, device=device),
+        dropped_mass=torch.empty(num_rays, 1, device=device),
+        live=torch.empty(num_rays, dtype=torch.int64, device=device),
+        explained=torch.empty(num_rays, 1, dtype=torch.bool, device=device),
+        numbers=torch.zeros(1 + num_heads, dtype=torch.int32, device=device),
+    )
     heads, (head_rows, biases, cube_row) = triton.next_power_of_2(num_heads), layout.constants
     at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
     launch(
         march_kernel, num_rays, at_once, *parts,
         head_rows, grids_of(layout), biases, cube_row, *dense_fields(tables),
-        live, explained, kept, skipped, dropped, *slots, numbers,
+        m.live, m.explained, m.kept, m.skipped_total, m.dropped_mass, *m.samples, m.numbers,
         num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
         K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,
         ALLOWS=rays.heads is not None, CHOOSES=rays.priorities is not None, BLENDS=options.blends,
         KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS, num_warps=1,
     )  # fmt: skip
-    return Slots(kept, slots, room, skipped, dropped, live, explained, numbers)
+    return m
 
 
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """Waits for the device once, to size the result."""
     m = march_into_slots(layout, tables, rays, options)
     widest, *of_heads = m.numbers.tolist()
-    shape, device = (len(m.kept), max(1, widest)), m.kept.device
-    packed = [*empty_samples(*shape, device=device), torch.empty(shape, dtype=torch.bool, device=device)]
-    size, width = packed[0].numel(), shape[1]
-    launch(pack_kernel, size, 1024, m.kept, *m.slots, *packed, size, width, m.room, BLOCK=1024)
-    left = {"skipped_total": m.skipped_total, "dropped_mass": m.dropped_mass}
-    return MergedSamples(*packed, **left, live=m.live, explained=m.explained, head_counts=tuple(of_heads))
+    width = max(1, widest)
+    valid = torch.arange(width, device=m.kept.device) < m.kept[:, None]
+    packed = (torch.where(valid.view(valid.shape + (1,) * (x.ndim - 2)), x[:, :width], 0) for x in m.samples)
+    heads, planes, *others = packed
+    left = (m.skipped_total, m.dropped_mass, m.live, m.explained, tuple(of_heads))
+    return MergedSamples(heads.long(), planes.long(), *others, valid, *left)
 
 
 def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
@@ -271,8 +265,9 @@ def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays,
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
     columns, block = sizes(channels, device, NUMBERS)
     launch(
-        show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, *dense(features),
-        grids_of(layout), gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
+        show_kernel, num_rays, block, m.kept, *m.samples, m.skipped_total, *dense(features),
+        grids_of(layout), gathered, mass, depth, median, winner,
+        num_rays, m.samples[0].shape[1], channels, len(layout.mpis),
         HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
         num_warps=lanes(block),
     )  # fmt: skip

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops.layout import Places
+
 
 class Rays(NamedTuple):
     """R rays, and the heads that may answer them."""
@@ -68,6 +70,10 @@ class MergedSamples:
     infinity, or all heads may answer and one does."""
     head_counts: tuple[int, ...] | None = None
     """Samples of each head, if known without synchronising."""
+
+    @property
+    def places(self) -> Places:
+        return Places(self.heads, self.planes, self.ndc, self.valid)
 
 
 def empty_samples(*shape: int, index: torch.dtype = torch.int64, device: torch.device | str = "cpu") -> list[Tensor]:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mmpi_ns.ops.dispatch import in_cpp, operation
+from mmpi_ns.ops.dispatch import operation
 
 FAR = -1e4
 """Pixel of a point behind the other image."""
@@ -56,7 +56,7 @@ class Measured(NamedTuple):
     """One over the squared error of a match; the error of a mean."""
 
 
-@operation()
+@operation(in_cpp=0)
 def place_pixels(
     inverse: Float[Tensor, "H W"], linear: Float[Tensor, "3 3"], b: Float[Tensor, "3"], first_row: int
 ) -> Places:
@@ -75,10 +75,7 @@ def place_pixels(
     return Places(x, y, torch.where(behind, 0.0, ahead))
 
 
-in_cpp(place_pixels)
-
-
-@operation()
+@operation(in_cpp=0)
 def follow_motion(
     x: Float[Tensor, "H W"], y: Float[Tensor, "H W"], motion: Float[Tensor, "R W 2"], first_row: int
 ) -> Moved:
@@ -100,10 +97,7 @@ def follow_motion(
     return Moved(moved_x, moved_y)
 
 
-in_cpp(follow_motion)
-
-
-@operation()
+@operation(in_cpp=0)
 def solve_matches(
     x: Float[Tensor, "R W"],
     y: Float[Tensor, "R W"],
@@ -138,10 +132,7 @@ def solve_matches(
     return Measured(torch.where(kept, inverse, 0.0), torch.where(kept, certainty, 0.0))
 
 
-in_cpp(solve_matches)
-
-
-@operation()
+@operation(in_cpp=0)
 def average_matches(
     inverse: Float[Tensor, "M R W"], certainty: Float[Tensor, "M R W"], most_relative: float
 ) -> Measured:
@@ -174,10 +165,7 @@ def average_matches(
     return Measured(torch.where(kept, mean, 0.0), torch.where(kept, error, 0.0))
 
 
-in_cpp(average_matches)
-
-
-@operation()
+@operation(in_cpp=0)
 def compare_depths(
     inverse: Float[Tensor, "R W"],
     error: Float[Tensor, "R W"],
@@ -207,9 +195,6 @@ def compare_depths(
     tolerance, apart = 3 * torch.hypot(their_errors, error) + same * expected, theirs - expected
     both &= theirs > 0
     return Compared(both & (apart.abs() < tolerance), both & (apart < -tolerance))
-
-
-in_cpp(compare_depths)
 
 
 def _linear(image: Tensor, linear: Tensor, first_row: int) -> list[Tensor]:

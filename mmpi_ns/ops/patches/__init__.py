@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 
-from mmpi_ns.ops.dispatch import in_cpp, operation
+from mmpi_ns.ops.dispatch import operation
 
 REACH = 2
 """Pixels of a patch on each side of its middle."""
@@ -55,7 +55,7 @@ class Patches(NamedTuple):
     show the patch; -1 where none does."""
 
 
-@operation()
+@operation(in_cpp=1)
 def compare_planes(
     gray: UInt8[Tensor, "H W"],
     patches: Patches,
@@ -75,10 +75,7 @@ def compare_planes(
     return _better(_References(gray, stride), patches, planes, others)
 
 
-in_cpp(compare_planes, least=1)
-
-
-@operation()
+@operation(in_cpp=1)
 def spread_planes(
     gray: UInt8[Tensor, "H W"],
     patches: Patches,
@@ -119,9 +116,6 @@ def spread_planes(
     scale = q / torch.where(towards < 0, towards.clamp(max=-GRAZING), towards.clamp(min=GRAZING))
     turned = torch.stack([q, scale * normal[..., 0] / fx, scale * normal[..., 1] / fy], -1)
     return _better(references, patches, turned, others)
-
-
-in_cpp(spread_planes, least=1)
 
 
 def _centers(image: Tensor) -> tuple[Tensor, Tensor]:

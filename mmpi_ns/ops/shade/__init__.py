@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts, structs
@@ -54,12 +54,29 @@ def run_layers(layers: Layers, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N
     return torch.nn.functional.linear(hidden, w3, b3)
 
 
-def sample_colors(
-    layers: Layers, features: Float[Tensor, "N C"], position: Float[Tensor, "N P"], direction: Float[Tensor, "N D"]
+def head_colors(
+    networks: SampleNetworks,
+    head: int,
+    features: Float[Tensor, "N C"],
+    ndc: Float[Tensor, "N 3"],
+    directions: Float[Tensor, "R 3"],
+    rays: Int[Tensor, "N"],
 ) -> Float[Tensor, "N 3"]:
-    """Colours in [0, 1] of samples whose positions and directions are encoded: the first three features are their
-    logits, to which the network adds what the view changes."""
-    return torch.sigmoid(features[:, :3] + run_layers(layers, torch.cat([features, position, direction], -1)))
+    """Colours in [0, 1] of samples of one head: the first three features are their logits, to which the network adds
+    what the view changes.
+
+    Args:
+        networks: of all heads.
+        head: of the samples.
+        features: of each sample.
+        ndc: position of each sample.
+        directions: of each ray, in the head's axes; encoded once a ray.
+        rays: ray of each sample.
+    """
+    position = positional_encoding(ndc, networks.position_frequencies)
+    direction = positional_encoding(directions, networks.direction_frequencies).index_select(0, rays)
+    said = run_layers(networks.layers[head], torch.cat([features, position, direction], -1))
+    return torch.sigmoid(features[:, :3] + said)
 
 
 def _check_networks(
@@ -94,9 +111,8 @@ def shade(
     _, _, ndc, valid = places
     colors = table.new_zeros(valid.numel(), 3)
     for k, (slots, features) in enumerate(interpolated(layout, table, places)):
-        position = positional_encoding(ndc.reshape(-1, 3)[slots], networks.position_frequencies)
-        direction = positional_encoding(rotate(axes[k], directions), networks.direction_frequencies)
-        colors[slots] = sample_colors(networks.layers[k], features, position, direction[slots // valid.shape[1]])
+        places_of_head = (ndc.reshape(-1, 3)[slots], rotate(axes[k], directions), slots // valid.shape[1])
+        colors[slots] = head_colors(networks, k, features, *places_of_head)
     return colors.view(*valid.shape, 3)
 
 

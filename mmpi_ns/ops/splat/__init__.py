@@ -52,30 +52,14 @@ def splat_image(gaussians: Gaussians, view: View, colors: Float[Tensor, "N 3"]) 
     return image
 
 
-def splat_sums(gaussians: Gaussians, view: View, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "N 4"]:
-    """What an image holds where each Gaussian is seen: the adjoint of ``splat_image``.
-
-    Args:
-        gaussians: what is seen.
-        view: the camera.
-        image: an image of that camera; an error for example.
-
-    Returns:
-        Sum over pixels of the weight that a Gaussian has there times (red, green, blue, 1).
-    """
-    sums = torch.zeros(len(gaussians.means), 4)
-    _run(splat_sums, gaussians, view, image=image, out=sums)
-    return sums
-
-
-def splat_opacities(
+def splat_errors(
     gaussians: Gaussians,
     view: View,
     colors: Float[Tensor, "N 3"],
     shown: Float[Tensor, "H W 3"],
     errors: Float[Tensor, "H W 3"],
-) -> Float[Tensor, "N 2"]:
-    """How opacities should change for an image to change by its errors.
+) -> Float[Tensor, "N 6"]:
+    """How colours and opacities should change for an image to change by its errors.
 
     Args:
         gaussians: what is seen.
@@ -85,11 +69,12 @@ def splat_opacities(
         errors: what is missing in it.
 
     Returns:
-        With J the change of a number of the image with the logit of a Gaussian's opacity, the sums over the image's
-        numbers of J error / (sum of |J| of all Gaussians) and of |J|.
+        Of each Gaussian the sum over pixels of its weight there times (error, 1), the adjoint of ``splat_image``. Then,
+        with J the change of a number of the image with the logit of its opacity, the sums over the image's numbers of
+        J error / (sum of |J| of all Gaussians) and of |J|.
     """
-    sums = torch.zeros(len(gaussians.means), 2)
-    _run(splat_opacities, gaussians, view, colors=colors, shown=shown, errors=errors, out=sums)
+    sums = torch.zeros(len(gaussians.means), 6)
+    _run(splat_errors, gaussians, view, colors=colors, shown=shown, errors=errors, out=sums)
     return sums
 
 

@@ -111,18 +111,11 @@ void mmpi_splat_image(const View* view, const Gaussians* all, const float* color
     for (size_t p = 0; p < light.size(); p++) image[4 * p + 3] = light[p];
 }
 
-// The sums [count, 4] over pixels of each Gaussian's weight times (error, 1).
-void mmpi_splat_sums(const View* view, const Gaussians* all, const float* errors, float* sums) {
-    lay(*view, sorted(*view, *all), [&](int64_t i, int64_t pixel, float alpha, float before) {
-        for (int c = 0; c < 3; c++) sums[4 * i + c] += before * alpha * errors[3 * pixel + c];
-        sums[4 * i + 3] += before * alpha;
-    });
-}
-
-// With J what a number of the image changes with the logit of a Gaussian's opacity, the sums [count, 2] over an image's
-// numbers of (J error / (sum of all Gaussians' |J|), |J|). `shown` is the image with its background, [height, width, 3].
-void mmpi_splat_opacities(const View* view, const Gaussians* all, const float* colors, const float* shown,
-                          const float* errors, float* sums) {
+// Sums [count, 6] over the pixels of an image: of each Gaussian's weight times (error, 1), and, with J what a number of
+// the image changes with the logit of its opacity, of (J error / (sum of all Gaussians' |J|), |J|). `shown` is the image
+// with its background, [height, width, 3].
+void mmpi_splat_errors(const View* view, const Gaussians* all, const float* colors, const float* shown,
+                       const float* errors, float* sums) {
     const std::vector<Seen> seen = sorted(*view, *all);
     std::vector<float> front, total(int64_t(view->width) * view->height * 3, 0.0f);
     const auto walk = [&](auto use) {
@@ -133,14 +126,17 @@ void mmpi_splat_opacities(const View* view, const Gaussians* all, const float* c
                 front[at] += before * alpha * colors[3 * i + c];
                 const float behind = (shown[at] - front[at]) / (1 - alpha);
                 const float change = alpha < STRONGEST ? alpha * (1 - all->alphas[i]) : 0.0f;
-                use(i, at, change * (before * colors[3 * i + c] - behind));
+                use(6 * i + c, at, before * alpha, change * (before * colors[3 * i + c] - behind));
             }
         });
     };
-    walk([&](int64_t, int64_t at, float slope) { total[at] += std::fabs(slope); });
-    walk([&](int64_t i, int64_t at, float slope) {
-        sums[2 * i] += slope * errors[at] / std::max(total[at], 1e-6f);
-        sums[2 * i + 1] += std::fabs(slope);
+    walk([&](int64_t, int64_t at, float, float slope) { total[at] += std::fabs(slope); });
+    walk([&](int64_t sum, int64_t at, float weight, float slope) {
+        float* own = sums + sum / 6 * 6;
+        sums[sum] += weight * errors[at];
+        if (sum % 6 == 0) own[3] += weight;
+        own[4] += slope * errors[at] / std::max(total[at], 1e-6f);
+        own[5] += std::fabs(slope);
     });
 }
 }
