@@ -119,7 +119,7 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
 
     def sample():
         forming = not model.progress.schedule.sharpened(model.progress.step)
-        options = model.config.sampling.march(field.plan, forming, blends=False)
+        options = model.config.sampling.options(field.plan, forming, blends=False)
         return march(field.layout, field.tables, rays_of(bundle), options)
 
     samples = sample()

@@ -38,12 +38,11 @@ from mmpi_ns.rendering.rendered import (
     RenderingConfig,
     background_of,
     bounded,
-    rays_of,
     render_rays,
     shown_outputs,
     winners,
 )
-from mmpi_ns.rendering.sampler import SamplingConfig
+from mmpi_ns.rendering.sampler import SamplingConfig, rays_of
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -226,7 +225,7 @@ class MMPIModel(Model):
                 head_mask[:, num_mpis:].fill_(True)
                 bundle = bundle.broadcast_to((num_mpis, asked)).flatten()
         blends = "reliability" in TRAINS[progress.phase.name] and self.blends(field)
-        options = self.config.sampling.march(field.plan, not progress.schedule.sharpened(progress.step), blends)
+        options = self.config.sampling.options(field.plan, not progress.schedule.sharpened(progress.step), blends)
         rays = render_rays(bundle, field, options, head_mask, choose)
         return {"training": replace(rays, times=len(bundle) // asked)}
 

@@ -10,7 +10,7 @@ from random_fields import OracleRay, _places, _table, bundle, random_field, rand
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import MarchOptions, show_rays
-from mmpi_ns.rendering.rendered import rays_of
+from mmpi_ns.rendering.sampler import rays_of
 
 
 def shown(field, rays, threshold=0.0, blends=False, **chosen):

@@ -133,12 +133,16 @@ def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_h
     """Images for display of a rendered image. Pixels that a texel spans: blue from 1/2, green 2, red from 8 on."""
     near = 1 / outputs["depth"].clamp(min=1e-9)
     some = near.flatten()[:: 1 + near.numel() // MOST_SORTED]
-    hue = torch.arange(num_heads, device=near.device)[:, None] * 0.61803 % 1 - near.new_tensor([0.0, 1 / 3, 2 / 3])
-    palette = 0.5 + 0.45 * torch.cos(2 * torch.pi * hue)
     return {
         "img": torch.cat([observed, outputs["rgb"]], 1),
         "accumulation": outputs["accumulation"].expand(-1, -1, 3),
         "inverse_depth": (near / some.quantile(0.98).clamp(min=1e-9)).clamp(0, 1).expand(-1, -1, 3),
-        "winning_mpi": palette[outputs["winning_mpi"][..., 0].long()],
+        "winning_mpi": head_palette(num_heads, observed.device)[outputs["winning_mpi"][..., 0].long()],
         "texel_pixels": apply_float_colormap((outputs["texel_pixels"].clamp(0.5, 8).log2() + 1) / 4, "turbo"),
     }
+
+
+def head_palette(count: int, device: torch.device | str) -> Float[Tensor, "H 3"]:
+    """Distinct colours, one for each head."""
+    hue = torch.arange(count, dtype=torch.float32, device=device) * 0.61803 % 1
+    return 0.5 + 0.45 * torch.cos(2 * torch.pi * (hue[:, None] - torch.tensor([0.0, 1 / 3, 2 / 3], device=device)))

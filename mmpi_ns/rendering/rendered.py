@@ -18,11 +18,13 @@ from mmpi_ns.field.tables import Lookup
 from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import Composite, composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.gather import RaySums
-from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, march, show_rays
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, show_rays
+from mmpi_ns.rendering.sampler import MMPISampler, rays_of
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
 """Grey levels of backgrounds by name."""
+SAMPLER = MMPISampler()
 
 
 def background_of(name: str, like: Tensor) -> Tensor:
@@ -83,13 +85,6 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     return bundle
 
 
-def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:
-    """Rays for the march, and the heads that may render them (see ``ops.march.Rays``)."""
-    nears, fars = ray_bundle.nears, ray_bundle.fars
-    assert nears is not None and fars is not None
-    return Rays(ray_bundle.origins, ray_bundle.directions, nears, fars, head_mask, choose)
-
-
 def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, first_head: int) -> dict[str, Tensor]:
     """What is told of the heads with the most weight in each ray.
 
@@ -131,8 +126,6 @@ def render_rays(
 ) -> RenderedRays:
     """Renders rays that have nears and fars, with gradients if enabled.
 
-    The march has none: the field differentiates through the samples that it keeps.
-
     Args:
         bundle: R rays.
         field: to render.
@@ -140,8 +133,7 @@ def render_rays(
         head_mask: heads that may render each ray; None for all.
         choose: priorities; each ray is rendered by the MPI of highest priority among those it meets (and the cube).
     """
-    with torch.no_grad():
-        samples = march(field.layout, field.tables, rays_of(bundle, head_mask, choose), options)
+    samples = SAMPLER(bundle, field, options, head_mask, choose)
     tau, lookup = samples.tau, None
     if torch.is_grad_enabled():
         tau, lookup = field.get_density(bundle, samples)

@@ -19,7 +19,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import blending, composite
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import MarchOptions, gpu, march
-from mmpi_ns.rendering.rendered import rays_of
+from mmpi_ns.rendering.sampler import rays_of
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 # Crossings -----------------------------------------------------------------------------------------------------------
