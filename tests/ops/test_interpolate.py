@@ -222,16 +222,12 @@ def places(rays=700, slots=9, heads=4):
 def test_samples_by_head_are_those_of_loops(counted):
     at = places()
     heads, valid = at.heads.reshape(-1).tolist(), at.valid.reshape(-1).tolist()
-    slots = [[i for i, h in enumerate(heads) if valid[i] and h == k] for k in range(5)]
-    for form in both(lambda: order_by_head(at, 5, [len(x) for x in slots] if counted else None)):
-        assert (
-            form.slots.tolist() == [i for x in slots for i in x]
-            and list(form.counts) == [*map(len, slots)]
-            and form.counts[4] == 0
-        )
-        assert torch.equal(form.heads, at.heads.reshape(-1)[form.slots])
-        assert torch.equal(form.planes, at.planes.reshape(-1)[form.slots])
-        assert torch.equal(form.ndc, at.ndc.reshape(-1, 3)[form.slots])
+    of_heads = [[i for i, h in enumerate(heads) if valid[i] and h == k] for k in range(5)]
+    for slots, *columns, counts in both(lambda: order_by_head(at, 5, [*map(len, of_heads)] if counted else None)):
+        assert slots.tolist() == [i for x in of_heads for i in x]
+        assert list(counts) == [*map(len, of_heads)] and counts[4] == 0
+        expected = (at.heads.reshape(-1)[slots], at.planes.reshape(-1)[slots], at.ndc.reshape(-1, 3)[slots])
+        assert all(torch.equal(a, b) for a, b in zip(columns, expected, strict=True))
 
 
 @pytest.mark.parametrize("threads", [2, 3, 7])
