@@ -23,7 +23,7 @@ class Default:
 
 DEFAULTS = {
     "mmpi": Default(20000, 4096, PlacementConfig(texel_pixels=1.2, max_texels=200e6)),
-    "mmpi-small": Default(2500, 1024, PlacementConfig(texel_pixels=1.0)),
+    "mmpi-small": Default(2500, 1024, PlacementConfig(texel_pixels=1.2)),
 }
 PIXELS = 6.5e6
 """Training pixels of a window up to which it is a small capture."""
