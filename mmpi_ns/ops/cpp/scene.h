@@ -34,6 +34,10 @@ inline int64_t row_in_brick(int32_t brick, int64_t y, int64_t x) {
     return int64_t(brick) * BRICK + ((y & 7) << 3) + (x & 7);
 }
 
+inline int64_t row_of(const Grid& grid, int64_t z, int64_t y, int64_t x) {
+    return row_in_brick(*grid.tile(z, y, x), y, x);
+}
+
 struct Cube {
     float lower[3], extent[3]; // extent = upper - lower
     float step, bias, interval;
@@ -102,5 +106,5 @@ inline int64_t nearest_texel(const Grid& grid, const float* ndc) {
         const float last = float(sizes[i] - 1);
         index[i] = int64_t(std::min(std::max(std::nearbyint((ndc[i] + 1) * (0.5f * last)), 0.0f), last));
     }
-    return row_in_brick(*grid.tile(index[2], index[1], index[0]), index[1], index[0]);
+    return row_of(grid, index[2], index[1], index[0]);
 }
