@@ -1,8 +1,8 @@
 """Depth of most pixels of the training images: dense matches between neighbouring views, each with its error.
 
 Every image is compared with its nearest neighbours. A rough depth, from SfM points and planes searched at a low
-resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by DIS
-optical flow, is small. A match on its epipolar line gives an inverse depth; consistent matches of several neighbours
+resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by optical
+flow (``ops/motion``), is small. A match on its epipolar line gives an inverse depth; consistent matches of several neighbours
 are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV and NumPy release
 Python's lock), and an image is in memory only while its neighbours are worked on.
 
@@ -29,6 +29,7 @@ from mmpi_ns.capture.patches import Surfaces, search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
+from mmpi_ns.ops.motion import find_motion
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_turn, num_threads, one_thread_each
@@ -49,8 +50,8 @@ ROUNDS, SEARCHED = {False: (1, 1, 1), True: (2, 1)}, {False: (1, 1), True: (1,)}
 """Rounds of matching, of small and of large images, at the working size divided by this; and with surfaces."""
 SECONDS, SEARCH_SECONDS = 0.55, 0.15
 """Processor seconds for a million working pixels of an image, and for its surfaces, for the forecast."""
-STRIDE, ITERATIONS = {False: 5, True: 6}, 8
-"""Pixels between patches of the optical flow, in small and in large images, and iterations."""
+STRIDE, COMPARISONS = {False: 5, True: 6}, 6
+"""Pixels between patches of the optical flow, in small and in large images, and comparisons of each."""
 NOISE, MAX_EPIPOLAR = 0.3, 1.0
 """Standard deviation of a match where images look alike, and its largest epipolar distance, working pixels."""
 WINDOW = 7
@@ -104,13 +105,13 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
 
 
 def measure(
-    view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow, of_view: tuple[Map, Map]
+    view: View, neighbour: View, start: Map, stride: int, of_view: tuple[Map, Map]
 ) -> tuple[Map, Map]:
     """Inverse depths [h, w] of a view's pixels by comparison with another view, and one over their squared errors (0:
-    none), from rough inverse depths and the view's ``mean_and_contrast``; ``flow`` finds small motions."""
+    none), from rough inverse depths, pixels between patches of the flow, and the view's ``mean_and_contrast``."""
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
-    motion = np.asarray(flow.calc(view.gray, look_up(neighbour.gray, x, y), None))  # type: ignore[call-overload]
+    motion = find_motion(view.gray, look_up(neighbour.gray, x, y), stride, COMPARISONS)
     near = torch.from_numpy(x), torch.from_numpy(y)
     x, y = np.empty_like(x), np.empty_like(y)
     for rows in strips(x.shape):
@@ -239,11 +240,6 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     if not others or min(view.gray.shape) < SMALLEST:
         return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    flow.setFinestScale(0)
-    flow.setVariationalRefinementIterations(0)
-    flow.setGradientDescentIterations(ITERATIONS)
-    flow.setPatchStride(STRIDE[is_large])
     rough, depth = rough_inverse_depth(view.reduced(rounds[0]) if rounds else view, points), None
     surfaces = None if rounds else search_surfaces(view, others, rough)
     if surfaces is not None:
@@ -262,7 +258,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
         small = view.reduced(factor)
         rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         of_view = mean_and_contrast(small.gray)
-        pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]
+        pairs = [measure(small, neighbour.reduced(factor), rough, STRIDE[is_large], of_view) for neighbour in others]
         depth = without_fringes(small, fuse(*zip(*pairs, strict=True)))
     assert depth is not None
     return depth if surfaces is None else filled(depth, surfaces)
