@@ -6,9 +6,6 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#ifdef __AVX512F__
-#include <immintrin.h>
-#endif
 
 namespace {
 
@@ -18,23 +15,6 @@ constexpr float LEAST_AHEAD = 1e-6f, LEAST_SHARE = 0.2f, LEAST_SQUARES = PIXELS,
 struct Plane {
     Lanes q, right, down;
 };
-
-// Sixteen numbers of a table.
-IntLanes gather(const int32_t* table, IntLanes at) {
-#ifdef __AVX512F__
-    return IntLanes(_mm512_i32gather_epi32(__m512i(at), table, sizeof *table));
-#endif
-    return each_lane<IntLanes>(at, [table](int32_t i) { return table[i]; });
-}
-
-// 1 / x to 1e-7, of what is at least 1e-12.
-Lanes reciprocal(Lanes x) {
-#ifdef __AVX512F__
-    const Lanes rough = Lanes(_mm512_rcp14_ps(__m512(x)));
-    return rough * (2.0f - x * rough);
-#endif
-    return 1.0f / x;
-}
 
 // Between four bytes: a pixel, the one to its right, and the two below.
 Lanes between(IntLanes corners, Lanes u, Lanes v) {
