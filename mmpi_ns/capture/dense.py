@@ -104,9 +104,7 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
     return look_up(coarse, grid_x / step + 0.5, grid_y / step + 0.5)
 
 
-def measure(
-    view: View, neighbour: View, start: Map, stride: int, of_view: tuple[Map, Map]
-) -> tuple[Map, Map]:
+def measure(view: View, neighbour: View, start: Map, stride: int, of_view: tuple[Map, Map]) -> tuple[Map, Map]:
     """Inverse depths [h, w] of a view's pixels by comparison with another view, and one over their squared errors (0:
     none), from rough inverse depths, pixels between patches of the flow, and the view's ``mean_and_contrast``."""
     parallax = Parallax.between(view, neighbour)

@@ -37,7 +37,9 @@ class Oracle:
         first = {}
         for key, (row, column) in self.corners.items():
             at = (column + 4.5) * b / w - 0.5, (row + 4.5) * a / h - 0.5
-            start = np.concatenate([look(coarse[..., n].astype(float), *at) * of for n, of in enumerate((w / b, h / a))])
+            start = np.concatenate(
+                [look(coarse[..., n].astype(float), *at) * of for n, of in enumerate((w / b, h / a))]
+            )
             first[key] = self.descend(row, column, start)
         self.totals = np.zeros((h, w, 3))
         for (i, j), (row, column) in self.corners.items():
