@@ -2,9 +2,9 @@
 
 Every image is compared with its nearest neighbours. A rough depth, from SfM points and planes searched at a low
 resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by optical
-flow (``ops/motion``), is small. A match on its epipolar line gives an inverse depth; consistent matches of several neighbours
-are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV and NumPy release
-Python's lock), and an image is in memory only while its neighbours are worked on.
+flow (``ops/motion``), is small. A match on its epipolar line gives an inverse depth; consistent matches of several
+neighbours are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV and
+NumPy release Python's lock), and an image is in memory only while its neighbours are worked on.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
@@ -27,7 +27,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from mmpi_ns.capture.patches import Surfaces, search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
+from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, strips
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
 from mmpi_ns.ops.motion import find_motion
 from mmpi_ns.scene.near_views import nearest_views
@@ -98,10 +98,16 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
         return np.full((height, width), middle, np.float32)
     step = 8
     x, y = np.meshgrid(np.arange(0, width + step, step), np.arange(0, height + step, step))
-    between, nearest = LinearNDInterpolator(at, inverse)(x, y), NearestNDInterpolator(at, inverse)(x, y)
-    coarse = np.where(np.isfinite(between), between, nearest).astype(np.float32)
-    grid_x, grid_y = pixel_grid((height, width))
-    return look_up(coarse, grid_x / step + 0.5, grid_y / step + 0.5)
+    coarse = LinearNDInterpolator(at, inverse)(x, y)
+    if (outside := ~np.isfinite(coarse)).any():
+        coarse[outside] = NearestNDInterpolator(at, inverse)(x[outside], y[outside])
+    # Between the points of the grid, first along rows, then along columns.
+    for n, axis in ((width, 1), (height, 0)):
+        place = (np.arange(n) + 0.5) / step
+        low, share = np.floor(place).astype(int), np.float32(place % 1)
+        lower, upper = (np.take(np.float32(coarse), at, axis) for at in (low, low + 1))
+        coarse = lower + (share if axis else share[:, None]) * (upper - lower)
+    return coarse
 
 
 def measure(view: View, neighbour: View, start: Map, stride: int, of_view: tuple[Map, Map]) -> tuple[Map, Map]:

@@ -138,7 +138,6 @@ def _between(values: Tensor, x: Tensor, y: Tensor) -> Tensor:
 def find_motion(gray: NDArray[np.uint8], other: NDArray[np.uint8], stride: int, rounds: int) -> NDArray[np.float32]:
     """The same from coarse to fine. [H, W, 2]"""
     pairs = [(gray, other)]
-    height, width = gray.shape
     while min(pairs[-1][0].shape) >= 2 * SIDE and max(pairs[-1][0].shape) >= 6 * SIDE:
         size = pairs[-1][0].shape[1] // 2, pairs[-1][0].shape[0] // 2
         pairs.append(tuple(np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), np.uint8) for x in pairs[-1]))
