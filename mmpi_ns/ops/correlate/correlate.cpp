@@ -5,14 +5,12 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
 #include <vector>
 
 namespace {
 
 constexpr int REACH = 3, SIDE = 2 * REACH + 1, PIXELS = SIDE * SIDE, STEPS = 32; // as in __init__.py
 constexpr float LEAST_AHEAD = 1e-6f;
-typedef uint8_t Bytes __attribute__((vector_size(WIDTH)));
 
 // The nearest whole numbers; of less than 2^22.
 Lanes rounded(Lanes x) { return (x + 12582912.0f) - 12582912.0f; }
@@ -39,8 +37,7 @@ void warp_row(const int32_t* corners, int64_t height, int64_t width, const float
         const Lanes three = real(four >> 16 & 255), last = real(four >> 24 & 255);
         const Lanes upper = one * float(STEPS) + u * (two - one), lower = three * float(STEPS) + u * (last - three);
         const Lanes value = (upper * float(STEPS) + v * (lower - upper)) * (1.0f / (STEPS * STEPS)) + 0.5f;
-        const Bytes bytes = __builtin_convertvector(truncated(value), Bytes);
-        std::memcpy(to + column, &bytes, std::min<int64_t>(WIDTH, count - column));
+        store_some(to + column, __builtin_convertvector(truncated(value), ByteLanes), count - column);
     }
 }
 
@@ -88,20 +85,15 @@ void correlate(const uint8_t* gray, const float* mean, const float* contrast, co
             add_seven(sums, windows.data() + n * padded, width);
         }
         for (int64_t x = 0; x < width; x += WIDTH) {
-            const int64_t i = row * width + x, count = std::min<int64_t>(WIDTH, width - x);
-            IntLanes sums[3], here{};
-            Lanes means{}, contrasts{};
-            for (int n = 0; n < 3; n++) std::memcpy(&sums[n], windows.data() + n * padded + x, sizeof sums[n]);
-            std::memcpy(&means, mean + i, count * sizeof(float));
-            std::memcpy(&contrasts, contrast + i, count * sizeof(float));
-            Bytes bytes{};
-            std::memcpy(&bytes, &seen[i], count);
-            here = __builtin_convertvector(bytes, IntLanes);
+            const int64_t i = row * width + x, count = width - x;
+            IntLanes sums[3];
+            for (int n = 0; n < 3; n++) sums[n] = load_some<IntLanes>(windows.data() + n * padded + x, WIDTH);
+            const Lanes means = load_some<Lanes>(mean + i, count), contrasts = load_some<Lanes>(contrast + i, count);
+            const IntLanes here = __builtin_convertvector(load_some<ByteLanes>(&seen[i], count), IntLanes);
             const Lanes squares = most(real(PIXELS * sums[1] - sums[0] * sums[0]), splat(PIXELS * PIXELS));
             const Lanes common = real(PIXELS * sums[2] - truncated(means * float(PIXELS) + 0.5f) * sums[0]);
             const Lanes both = inverse_root(squares) * reciprocal(most(contrasts, splat(1)) * float(PIXELS));
-            const Lanes result = pick(here > 0, common * both, splat(-1));
-            std::memcpy(alike + i, &result, count * sizeof(float));
+            store_some(alike + i, pick(here > 0, common * both, splat(-1)), count);
         }
     }
 }

@@ -107,6 +107,27 @@ inline Lanes inverse_root(Lanes x) {
 inline void store(float* to, Lanes x) { __builtin_memcpy(to, &x, sizeof x); }
 inline void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
 
+// The first `count` of sixteen numbers, the others 0; and where they go. At most sixteen, without a call for all.
+template <typename To, typename From> inline To load_some(const From* from, int64_t count) {
+    To x{};
+    static_assert(sizeof x == WIDTH * sizeof *from, "sixteen numbers");
+    if (count >= WIDTH)
+        __builtin_memcpy(&x, from, sizeof x);
+    else
+        __builtin_memcpy(&x, from, count * sizeof *from);
+    return x;
+}
+
+template <typename From, typename To> inline void store_some(To* to, const From& x, int64_t count) {
+    static_assert(sizeof x == WIDTH * sizeof *to, "sixteen numbers");
+    if (count >= WIDTH)
+        __builtin_memcpy(to, &x, sizeof x);
+    else
+        __builtin_memcpy(to, &x, count * sizeof *to);
+}
+
+typedef uint8_t ByteLanes __attribute__((vector_size(WIDTH)));
+
 // e^x to 2 ulp for x in [-87, 88], clamped there (Cephes' expf).
 inline Lanes exp_lanes(Lanes x) {
     x = least(most(x, splat(-87)), splat(88));

@@ -35,9 +35,9 @@ struct Seen {
         };
         for (int64_t row = 0; row < height; row++)
             for (int64_t column = 0, i = row * width; column < width; column += WIDTH, i += WIDTH) {
-                const int64_t count = std::min<int64_t>(WIDTH, width - column);
-                Lanes q{}, at[3];
-                std::memcpy(&q, inverse + i, count * sizeof *inverse);
+                const int64_t count = width - column;
+                const Lanes q = load_some<Lanes>(inverse + i, count);
+                Lanes at[3];
                 for (int n = 0; n < 3; n++) {
                     const float start = linear[3 * n + 1] * (row + 0.5f) + linear[3 * n + 2];
                     at[n] = linear[3 * n] * (IOTA + (column + 0.5f)) + start + q * b[n];
@@ -48,7 +48,7 @@ struct Seen {
                 // The first pixel shows nothing.
                 const IntLanes color = gather(layer, pick(at[2] > LEAST_AHEAD, place, whole(0)));
                 const IntLanes is_shown = color >> 24 & 1;
-                put(&colors[i], color, count);
+                store_some(&colors[i], color, count);
                 put_bytes(&shown[i], is_shown, count);
                 if (!pairs) continue;
                 const IntLanes bits = gather(reinterpret_cast<const int32_t*>(around), place);
@@ -60,12 +60,8 @@ struct Seen {
             }
     }
 
-    static void put(int32_t* to, IntLanes x, int64_t count) { std::memcpy(to, &x, count * sizeof *to); }
-
     static void put_bytes(uint8_t* to, IntLanes x, int64_t count) {
-        typedef uint8_t Bytes __attribute__((vector_size(WIDTH)));
-        const Bytes bytes = __builtin_convertvector(x, Bytes);
-        std::memcpy(to, &bytes, count);
+        store_some(to, __builtin_convertvector(x, ByteLanes), count);
     }
 };
 
