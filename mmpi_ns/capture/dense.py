@@ -27,7 +27,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from mmpi_ns.capture.patches import Surfaces, search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, strips
+from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
 from mmpi_ns.ops.motion import find_motion
 from mmpi_ns.scene.near_views import nearest_views
@@ -37,6 +37,8 @@ from mmpi_ns.utils.parallel import in_turn, num_threads, one_thread_each
 T = TypeVar("T")
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 """Wraps what is worked on, of which there is this much."""
+Flow = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32]]
+"""Motion of what one image shows to another, right and down, pixels. [H, W, 2]"""
 
 NEIGHBOURS, MAX_ANGLE = 4, 40.0
 """Nearest views that each image is compared with, and the largest angle in degrees between their directions."""
@@ -51,7 +53,7 @@ ROUNDS, SEARCHED = {False: (1, 1, 1), True: (2, 1)}, {False: (1, 1), True: (1,)}
 SECONDS, SEARCH_SECONDS = 0.55, 0.15
 """Processor seconds for a million working pixels of an image, and for its surfaces, for the forecast."""
 STRIDE, COMPARISONS = {False: 5, True: 6}, 6
-"""Pixels between patches of the optical flow, in small and in large images, and comparisons of each."""
+"""Pixels between patches of the optical flow, in small and in large images, and most comparisons of each."""
 NOISE, MAX_EPIPOLAR = 0.3, 1.0
 """Standard deviation of a match where images look alike, and its largest epipolar distance, working pixels."""
 WINDOW = 7
@@ -101,21 +103,16 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
     coarse = LinearNDInterpolator(at, inverse)(x, y)
     if (outside := ~np.isfinite(coarse)).any():
         coarse[outside] = NearestNDInterpolator(at, inverse)(x[outside], y[outside])
-    # Between the points of the grid, first along rows, then along columns.
-    for n, axis in ((width, 1), (height, 0)):
-        place = (np.arange(n) + 0.5) / step
-        low, share = np.floor(place).astype(int), np.float32(place % 1)
-        lower, upper = (np.take(np.float32(coarse), at, axis) for at in (low, low + 1))
-        coarse = lower + (share if axis else share[:, None]) * (upper - lower)
-    return coarse
+    grid_x, grid_y = pixel_grid((height, width))
+    return look_up(coarse.astype(np.float32), grid_x / step + 0.5, grid_y / step + 0.5)
 
 
-def measure(view: View, neighbour: View, start: Map, stride: int, of_view: tuple[Map, Map]) -> tuple[Map, Map]:
+def measure(view: View, neighbour: View, start: Map, flow: Flow, of_view: tuple[Map, Map]) -> tuple[Map, Map]:
     """Inverse depths [h, w] of a view's pixels by comparison with another view, and one over their squared errors (0:
-    none), from rough inverse depths, pixels between patches of the flow, and the view's ``mean_and_contrast``."""
+    none), from rough inverse depths and the view's ``mean_and_contrast``; ``flow`` finds small motions."""
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
-    motion = find_motion(view.gray, look_up(neighbour.gray, x, y), stride, COMPARISONS)
+    motion = flow(view.gray, look_up(neighbour.gray, x, y))
     near = torch.from_numpy(x), torch.from_numpy(y)
     x, y = np.empty_like(x), np.empty_like(y)
     for rows in strips(x.shape):
@@ -244,6 +241,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     if not others or min(view.gray.shape) < SMALLEST:
         return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
+    flow = _flow_of_movers() if rounds else lambda a, b: find_motion(a, b, STRIDE[is_large], COMPARISONS)
     rough, depth = rough_inverse_depth(view.reduced(rounds[0]) if rounds else view, points), None
     surfaces = None if rounds else search_surfaces(view, others, rough)
     if surfaces is not None:
@@ -262,10 +260,20 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
         small = view.reduced(factor)
         rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         of_view = mean_and_contrast(small.gray)
-        pairs = [measure(small, neighbour.reduced(factor), rough, STRIDE[is_large], of_view) for neighbour in others]
+        pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]
         depth = without_fringes(small, fuse(*zip(*pairs, strict=True)))
     assert depth is not None
     return depth if surfaces is None else filled(depth, surfaces)
+
+
+def _flow_of_movers() -> Flow:
+    """OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/moving.md)."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow.setFinestScale(0)
+    flow.setVariationalRefinementIterations(0)
+    flow.setGradientDescentIterations(8)
+    flow.setPatchStride(STRIDE[False])
+    return lambda a, b: np.asarray(flow.calc(a, b, None), np.float32)  # type: ignore[call-overload]
 
 
 def filled(depth: Depth, surfaces: Surfaces) -> Depth:
