@@ -277,11 +277,11 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     mine, surfaces = possible_depths(shot, others)
     for n, inverse in enumerate(mine + surfaces):
         compared = compare_colors(color, torch.from_numpy(inverse), layers, n >= len(mine))
-        distances, pair, agreed = (part.numpy() for part in compared)
+        pair, agreed = compared.pair.numpy(), compared.agreed.numpy()
         possible = inverse > 0
         if shot.ground is not None:
             possible &= inverse >= SOLID * shot.ground
-        first, second = (levels | all_where(~possible) for levels in two_least(distances))
+        first, second = (levels | all_where(~possible) for levels in two_least(list(compared.levels.numpy())))
         one, two = np.minimum(one, first), np.minimum(two, second)
         behind = np.maximum(behind, pair & all_where(possible))
         judged |= agreed & possible

@@ -123,8 +123,8 @@ def at_depth(view: View, of_view: tuple[Map, Map], others: Sequence[View]) -> Ca
     grays = [np.where(other.inside, np.maximum(other.gray, 1), 0).astype(np.uint8) for other in others]
     parallax = [Parallax.between(view, other).tensors for other in others]
     compared = Compared.of([torch.from_numpy(gray) for gray in grays], parallax)
-    here = [torch.from_numpy(part) for part in (view.gray, *of_view)]
-    return lambda inverse: correlate_at(*here, compared, float(inverse)).numpy()
+    gray, mean, contrast = (torch.from_numpy(part) for part in (view.gray, *of_view))
+    return lambda inverse: correlate_at(gray, mean, contrast, compared, float(inverse)).numpy()
 
 
 def solid(moves: Mask, ground: Map) -> Mask:

@@ -137,11 +137,12 @@ def _between(values: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 def find_motion(gray: NDArray[np.uint8], other: NDArray[np.uint8], stride: int, rounds: int) -> NDArray[np.float32]:
     """The same from coarse to fine. [H, W, 2]"""
-    pairs = [(gray, other)]
-    while min(pairs[-1][0].shape) >= 2 * SIDE and max(pairs[-1][0].shape) >= 6 * SIDE:
-        size = pairs[-1][0].shape[1] // 2, pairs[-1][0].shape[0] // 2
-        pairs.append(tuple(np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), np.uint8) for x in pairs[-1]))
+    levels = [[gray, other]]
+    while min(levels[-1][0].shape) >= 2 * SIDE and max(levels[-1][0].shape) >= 6 * SIDE:
+        height, width = levels[-1][0].shape
+        size = width // 2, height // 2
+        levels.append([np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), np.uint8) for x in levels[-1]])
     motion = torch.zeros(1, 1, 2)
-    for pair in reversed(pairs):
-        motion = refine_motion(*map(torch.from_numpy, pair), motion, stride, rounds)
+    for image, moved in reversed(levels):
+        motion = refine_motion(torch.from_numpy(image), torch.from_numpy(moved), motion, stride, rounds)
     return motion.numpy()
