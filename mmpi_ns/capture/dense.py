@@ -1,10 +1,10 @@
 """Depth of most pixels of the training images: dense matches between neighbouring views, each with its error.
 
 Every image is compared with its nearest neighbours. A rough depth, from SfM points and planes searched at a low
-resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by DIS
-optical flow, is small. A match on its epipolar line gives an inverse depth; consistent matches of several neighbours
-are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV and NumPy release
-Python's lock), and an image is in memory only while its neighbours are worked on.
+resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by optical
+flow (``ops/motion``), is small. A match on its epipolar line gives an inverse depth; consistent matches of several
+neighbours are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV and
+NumPy release Python's lock), and an image is in memory only while its neighbours are worked on.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
@@ -29,6 +29,7 @@ from mmpi_ns.capture.patches import Surfaces, search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
+from mmpi_ns.ops.motion import find_motion
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_turn, num_threads, one_thread_each
@@ -36,6 +37,8 @@ from mmpi_ns.utils.parallel import in_turn, num_threads, one_thread_each
 T = TypeVar("T")
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 """Wraps what is worked on, of which there is this much."""
+Flow = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32]]
+"""Motion of what one image shows to another, right and down, pixels. [H, W, 2]"""
 
 NEIGHBOURS, MAX_ANGLE = 4, 40.0
 """Nearest views that each image is compared with, and the largest angle in degrees between their directions."""
@@ -49,8 +52,8 @@ ROUNDS, SEARCHED = {False: (1, 1, 1), True: (2, 1)}, {False: (1, 1), True: (1,)}
 """Rounds of matching, of small and of large images, at the working size divided by this; and with surfaces."""
 SECONDS, SEARCH_SECONDS = 0.55, 0.15
 """Processor seconds for a million working pixels of an image, and for its surfaces, for the forecast."""
-STRIDE, ITERATIONS = {False: 5, True: 6}, 8
-"""Pixels between patches of the optical flow, in small and in large images, and iterations."""
+STRIDE, COMPARISONS = {False: 5, True: 6}, 6
+"""Pixels between patches of the optical flow, in small and in large images, and most comparisons of each."""
 NOISE, MAX_EPIPOLAR = 0.3, 1.0
 """Standard deviation of a match where images look alike, and its largest epipolar distance, working pixels."""
 WINDOW = 7
@@ -97,20 +100,19 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
         return np.full((height, width), middle, np.float32)
     step = 8
     x, y = np.meshgrid(np.arange(0, width + step, step), np.arange(0, height + step, step))
-    between, nearest = LinearNDInterpolator(at, inverse)(x, y), NearestNDInterpolator(at, inverse)(x, y)
-    coarse = np.where(np.isfinite(between), between, nearest).astype(np.float32)
+    coarse = LinearNDInterpolator(at, inverse)(x, y)
+    if (outside := ~np.isfinite(coarse)).any():
+        coarse[outside] = NearestNDInterpolator(at, inverse)(x[outside], y[outside])
     grid_x, grid_y = pixel_grid((height, width))
-    return look_up(coarse, grid_x / step + 0.5, grid_y / step + 0.5)
+    return look_up(coarse.astype(np.float32), grid_x / step + 0.5, grid_y / step + 0.5)
 
 
-def measure(
-    view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow, of_view: tuple[Map, Map]
-) -> tuple[Map, Map]:
+def measure(view: View, neighbour: View, start: Map, flow: Flow, of_view: tuple[Map, Map]) -> tuple[Map, Map]:
     """Inverse depths [h, w] of a view's pixels by comparison with another view, and one over their squared errors (0:
     none), from rough inverse depths and the view's ``mean_and_contrast``; ``flow`` finds small motions."""
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
-    motion = np.asarray(flow.calc(view.gray, look_up(neighbour.gray, x, y), None))  # type: ignore[call-overload]
+    motion = flow(view.gray, look_up(neighbour.gray, x, y))
     near = torch.from_numpy(x), torch.from_numpy(y)
     x, y = np.empty_like(x), np.empty_like(y)
     for rows in strips(x.shape):
@@ -239,11 +241,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     if not others or min(view.gray.shape) < SMALLEST:
         return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    flow.setFinestScale(0)
-    flow.setVariationalRefinementIterations(0)
-    flow.setGradientDescentIterations(ITERATIONS)
-    flow.setPatchStride(STRIDE[is_large])
+    flow = _flow_of_movers() if rounds else lambda a, b: find_motion(a, b, STRIDE[is_large], COMPARISONS)
     rough, depth = rough_inverse_depth(view.reduced(rounds[0]) if rounds else view, points), None
     surfaces = None if rounds else search_surfaces(view, others, rough)
     if surfaces is not None:
@@ -266,6 +264,16 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
         depth = without_fringes(small, fuse(*zip(*pairs, strict=True)))
     assert depth is not None
     return depth if surfaces is None else filled(depth, surfaces)
+
+
+def _flow_of_movers() -> Flow:
+    """OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/moving.md)."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow.setFinestScale(0)
+    flow.setVariationalRefinementIterations(0)
+    flow.setGradientDescentIterations(8)
+    flow.setPatchStride(STRIDE[False])
+    return lambda a, b: np.asarray(flow.calc(a, b, None), np.float32)  # type: ignore[call-overload]
 
 
 def filled(depth: Depth, surfaces: Surfaces) -> Depth:

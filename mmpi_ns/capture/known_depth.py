@@ -37,7 +37,7 @@ from mmpi_ns.utils.parallel import in_order, num_threads
 
 Codes = NDArray[np.int16]
 
-VERSION = 14
+VERSION = 15
 """Version of the algorithm: cached depths of another version are recomputed."""
 FINER, WIDEST = 2.0, 1600
 """Images are matched at this multiple of the training size, and at most this wide, if the originals are available."""
@@ -101,7 +101,7 @@ def packed(values: ArrayLike) -> Codes:
 
 def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
     """The inverse of ``packed``."""
-    return torch.where(codes == UNKNOWN, 0.0, torch.exp2(codes.float() / OCTAVE))
+    return torch.exp2(codes.float() / OCTAVE).masked_fill_(codes == UNKNOWN, 0.0)
 
 
 def know_depths(
@@ -266,8 +266,8 @@ def with_continued(depths: KnownDepth, posed: PosedImages, dataset: MMPIDataset,
 
     def codes_of(i: int) -> Codes:
         """Computed for every n-th pixel of a large image."""
-        codes, hidden = np.array(depths.codes[i]), ~dataset.usable(i)
-        codes[hidden] = UNKNOWN
+        codes, hidden = np.array(depths.codes[i]), ~dataset.usable(i)[..., None]
+        np.copyto(codes, UNKNOWN, where=hidden)
         step = -(-max(codes.shape[:2]) // CONTINUED)
         rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
         pixels = np.stack(np.meshgrid(i, rows, columns, indexing="ij"), -1).reshape(-1, 3)
@@ -278,10 +278,9 @@ def with_continued(depths: KnownDepth, posed: PosedImages, dataset: MMPIDataset,
         points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
         seen = ~is_lone(posed, i, points)
         extended[down[seen], across[seen]] = 0
-        for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
-            part = codes[first : first + step]
-            np.copyto(part, np.repeat(fine, step, 0)[: part.shape[1]], where=part[..., :1] == UNKNOWN)
-        codes[hidden] = UNKNOWN
+        fine = packed(extended).repeat(step, 0).repeat(step, 1)[: codes.shape[0], : codes.shape[1]]
+        np.copyto(codes, fine, where=codes[..., :1] == UNKNOWN)
+        np.copyto(codes, UNKNOWN, where=hidden)
         return codes
 
     count = len(depths.codes)

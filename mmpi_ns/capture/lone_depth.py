@@ -20,7 +20,7 @@ from mmpi_ns.scene.near_views import nearest_views
 
 WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)
 """Widths of the Gaussian weights, as fractions of the longer side of the image; the most certain fit is used."""
-PIXELS = 4.0
+PIXELS = 2.0
 """Largest standard deviation of a blur in pixels; wider ones are computed on smaller images."""
 ENOUGH = 0.05
 """Smallest weighted fraction of known pixels around a pixel for which a plane is fitted."""

@@ -70,10 +70,17 @@ class Surfaces:
         farthest = cv2.erode(np.where(inverse > 0, inverse, np.inf).astype(np.float32), kernel)
         steps = (inverse > 0) & (cv2.dilate(inverse, kernel) / SAME > farthest)
         near = cv2.dilate(steps.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8))
-        planes, rows, columns = _resized(torch.from_numpy(self.planes), shape)
-        inverse, certain = planes[..., 0].numpy(), np.where(near > 0, 0, self.error)
-        error = np.where(inverse > 0, certain[rows.numpy()[:, None], columns.numpy()], 0)
-        return np.where(error > 0, inverse, 0).astype(np.float32), error.astype(np.float32)
+        certain = np.where(near > 0, 0, self.error)
+        layers = cv2.resize(np.dstack([self.planes, certain]), shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        inverse, across, along, error = cv2.split(layers)
+        # From the middles of the small pixels.
+        down, right = (
+            ((np.arange(to) + 0.5) * n / to % 1 - 0.5).astype(np.float32)
+            for n, to in zip(self.error.shape, shape, strict=True)
+        )
+        inverse = inverse + across * right + along * down[:, None]
+        is_known = (error > 0) & (inverse > 0)
+        return np.where(is_known, inverse, 0), np.where(is_known, error, 0)
 
 
 def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces | None:
@@ -106,7 +113,7 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
             start[..., 0] = torch.from_numpy(cv2.resize(rough, shape[::-1]))
             guesses = [start, *_random_planes(rough, shape, pinhole, random)]
         else:
-            guesses = [_resized(patches.planes, shape)[0]]
+            guesses = [_resized(patches.planes, shape)]
         patches = Patches(guesses[0], torch.full(shape, -1.0))
         for planes in guesses:
             patches = compare_planes(gray, patches, planes, compared, STRIDE)
@@ -132,9 +139,8 @@ def _random_planes(rough: Map, shape: tuple[int, ...], pinhole: Tensor, random: 
     return torch.stack([q, scale * right / fx, scale * down / fy], -1)
 
 
-def _resized(planes: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Planes [h, w, 3] of an image at another size [H, W, 3]: those through the nearest pixels, whose rows and columns
-    follow."""
+def _resized(planes: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Planes [h, w, 3] of an image at another size [H, W, 3]: those through the nearest pixels."""
     (rows, down, height), (columns, right, width) = (
         (at.long().clamp(max=n - 1), at, n / to)
         for n, to in zip(planes.shape[:2], shape, strict=True)
@@ -142,7 +148,7 @@ def _resized(planes: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor, Te
     )
     q, across, along = planes[rows[:, None], columns].unbind(-1)
     q = q + across * (right - columns - 0.5) + along * (down - rows - 0.5)[:, None]
-    return torch.stack([q, across * width, along * height], -1), rows, columns
+    return torch.stack([q, across * width, along * height], -1)
 
 
 def _certain(view: View, others: Sequence[View], patches: Patches) -> Surfaces:

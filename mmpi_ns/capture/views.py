@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,17 +38,22 @@ class View:
     """[3, 4] camera to world, OpenGL axes."""
     inside: NDArray[np.bool_]
     """[h, w] where the lens shows something."""
+    _reduced: dict[float, View] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """What ``reduced`` returned before: all neighbours of an image ask for the same sizes."""
 
     def reduced(self, factor: float) -> View:
         """The view at one over ``factor`` of its size."""
         if factor == 1:
             return self
+        if (before := self._reduced.get(factor)) is not None:
+            return before
         height, width = self.gray.shape
         size = max(1, round(width / factor)), max(1, round(height / factor))
         pinhole = self.pinhole * np.tile([size[0] / width, size[1] / height], 2)
         gray = cv2.resize(self.gray, size, interpolation=cv2.INTER_AREA)
         inside = cv2.resize(self.inside.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-        return replace(self, gray=np.asarray(gray, np.uint8), pinhole=pinhole, inside=inside > 0)
+        smaller = replace(self, gray=np.asarray(gray, np.uint8), pinhole=pinhole, inside=inside > 0)
+        return self._reduced.setdefault(factor, smaller)
 
 
 def load_view(images: PosedImages, i: int, width: int) -> View:

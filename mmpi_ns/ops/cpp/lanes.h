@@ -2,6 +2,9 @@
 #pragma once
 #include <cmath>
 #include <cstdint>
+#ifdef __AVX512F__
+#include <immintrin.h>
+#endif
 
 typedef float Lanes __attribute__((vector_size(64)));
 typedef int32_t IntLanes __attribute__((vector_size(64)));
@@ -75,8 +78,55 @@ inline Lanes root(Lanes x) {
     return load(each);
 }
 
+// Sixteen numbers of a table.
+inline IntLanes gather(const int32_t* table, IntLanes at) {
+#ifdef __AVX512F__
+    return IntLanes(_mm512_i32gather_epi32(__m512i(at), table, sizeof *table));
+#endif
+    return each_lane<IntLanes>(at, [table](int32_t i) { return table[i]; });
+}
+
+// 1 / x to 1e-7, of what is at least 1e-12.
+inline Lanes reciprocal(Lanes x) {
+#ifdef __AVX512F__
+    const Lanes rough = Lanes(_mm512_rcp14_ps(__m512(x)));
+    return rough * (2.0f - x * rough);
+#endif
+    return 1.0f / x;
+}
+
+// 1 / sqrt(x) to 1e-6, of what is at least 1e-20.
+inline Lanes inverse_root(Lanes x) {
+#ifdef __AVX512F__
+    const Lanes rough = Lanes(_mm512_rsqrt14_ps(__m512(x)));
+    return rough * (1.5f - 0.5f * x * rough * rough);
+#endif
+    return 1.0f / root(x);
+}
+
 inline void store(float* to, Lanes x) { __builtin_memcpy(to, &x, sizeof x); }
 inline void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
+
+// The first `count` of sixteen numbers, the others 0; and where they go. At most sixteen, without a call for all.
+template <typename To, typename From> inline To load_some(const From* from, int64_t count) {
+    To x{};
+    static_assert(sizeof x == WIDTH * sizeof *from, "sixteen numbers");
+    if (count >= WIDTH)
+        __builtin_memcpy(&x, from, sizeof x);
+    else
+        __builtin_memcpy(&x, from, count * sizeof *from);
+    return x;
+}
+
+template <typename From, typename To> inline void store_some(To* to, const From& x, int64_t count) {
+    static_assert(sizeof x == WIDTH * sizeof *to, "sixteen numbers");
+    if (count >= WIDTH)
+        __builtin_memcpy(to, &x, sizeof x);
+    else
+        __builtin_memcpy(to, &x, count * sizeof *to);
+}
+
+typedef uint8_t ByteLanes __attribute__((vector_size(WIDTH)));
 
 // e^x to 2 ulp for x in [-87, 88], clamped there (Cephes' expf).
 inline Lanes exp_lanes(Lanes x) {

@@ -5,30 +5,11 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
 #include <vector>
 
 namespace {
 
 constexpr float FAR = -1e4f, LEAST_AHEAD = 1e-6f, AGREE = 2.5f; // as in __init__.py
-
-// The first `count` of sixteen numbers, the others 0.
-Lanes some(const float* from, int64_t count) {
-    if (count >= WIDTH) return load(from);
-    Lanes x{};
-    std::memcpy(&x, from, count * sizeof(float));
-    return x;
-}
-
-void put(float* to, Lanes x, int64_t count) { std::memcpy(to, &x, std::min<int64_t>(count, WIDTH) * sizeof(float)); }
-
-Mask some(const bool* from, int64_t count) {
-    int32_t each[WIDTH] = {};
-    for (int64_t i = 0; i < std::min<int64_t>(count, WIDTH); i++) each[i] = -from[i];
-    Mask where;
-    std::memcpy(&where, each, sizeof where);
-    return where;
-}
 
 // The three parts of a = linear (x, y, 1) at sixteen pixels of a row.
 struct Linear {
@@ -48,12 +29,12 @@ void mmpi_place_pixels(int64_t begin, int64_t end, const float* inverse, const f
         for (int64_t column = 0; column < width; column += WIDTH) {
             const int64_t i = row * width + column, count = width - column;
             const Linear at(linear, column, first_row + row);
-            const Lanes q = some(inverse + i, count), depth = at.a[2] + q * b[2];
+            const Lanes q = load_some<Lanes>(inverse + i, count), depth = at.a[2] + q * b[2];
             const Mask is_ahead = depth > LEAST_AHEAD;
             const Lanes divisor = pick(is_ahead, depth, splat(1));
-            put(x + i, pick(is_ahead, (at.a[0] + q * b[0]) / divisor, splat(FAR)), count);
-            put(y + i, pick(is_ahead, (at.a[1] + q * b[1]) / divisor, splat(FAR)), count);
-            put(ahead + i, pick(is_ahead, depth, Lanes{}), count);
+            store_some(x + i, pick(is_ahead, (at.a[0] + q * b[0]) / divisor, splat(FAR)), count);
+            store_some(y + i, pick(is_ahead, (at.a[1] + q * b[1]) / divisor, splat(FAR)), count);
+            store_some(ahead + i, pick(is_ahead, depth, Lanes{}), count);
         }
 }
 
@@ -91,19 +72,20 @@ void mmpi_solve_matches(int64_t begin, int64_t end, const float* x, const float*
         for (int64_t column = 0; column < width; column += WIDTH) {
             const int64_t i = row * width + column, count = width - column;
             const Linear at(linear, column, first_row + row);
-            const Lanes u = some(x + i, count), v = some(y + i, count);
+            const Lanes u = load_some<Lanes>(x + i, count), v = load_some<Lanes>(y + i, count);
             const Lanes r1 = at.a[0] - u * at.a[2], s1 = b[0] - u * b[2];
             const Lanes r2 = at.a[1] - v * at.a[2], s2 = b[1] - v * b[2];
             const Lanes squared = most(s1 * s1 + s2 * s2, splat(1e-20f)), q = -(r1 * s1 + r2 * s2) / squared;
             const Lanes depth = at.a[2] + q * b[2], across = r1 * s2 - r2 * s1;
             const Lanes off_line = across * across / (squared * depth * depth);
-            const Lanes noise = (variance + off_line) * (11 - 10 * least(splat(1), some(alike + i, count)));
+            const Lanes noise = (variance + off_line) * (11 - 10 * least(splat(1), load_some<Lanes>(alike + i, count)));
             const Lanes sure = squared / (depth * depth * noise);
             const Mask finite = (magnitude(q) < INFINITY) & (magnitude(sure) < INFINITY);
             const Mask near = (depth > LEAST_AHEAD) & (off_line < farthest_squared);
-            const Mask kept = some(usable + i, count) & near & finite;
-            put(inverse + i, pick(kept, q, Lanes{}), count);
-            put(certainty + i, pick(kept, sure, Lanes{}), count);
+            const Mask counts = __builtin_convertvector(load_some<ByteLanes>(usable + i, count), IntLanes) != 0;
+            const Mask kept = counts & near & finite;
+            store_some(inverse + i, pick(kept, q, Lanes{}), count);
+            store_some(certainty + i, pick(kept, sure, Lanes{}), count);
         }
 }
 
@@ -144,8 +126,8 @@ void mmpi_average_matches(int64_t begin, int64_t end, const float* inverse, cons
         const int64_t count = end * width - p;
         Lanes all{}, measured{}, best{}, average{}, deviation{};
         for (int64_t n = 0; n < measurements; n++) {
-            q[n] = some(inverse + n * pixels + p, count);
-            weight[n] = some(certainty + n * pixels + p, count);
+            q[n] = load_some<Lanes>(inverse + n * pixels + p, count);
+            weight[n] = load_some<Lanes>(certainty + n * pixels + p, count);
             variance[n] = AGREE * AGREE / most(weight[n], splat(1e-30f));
             all += weight[n];
             measured += pick(weight[n] > 0, splat(1), Lanes{});
@@ -172,8 +154,8 @@ void mmpi_average_matches(int64_t begin, int64_t end, const float* inverse, cons
             deviation = pick(better, root(most(scatter, splat(1)) / total), deviation);
         }
         const Mask kept = (best > 0) & (deviation < most_relative * average);
-        put(mean + p, pick(kept, average, Lanes{}), count);
-        put(error + p, pick(kept, deviation, Lanes{}), count);
+        store_some(mean + p, pick(kept, average, Lanes{}), count);
+        store_some(error + p, pick(kept, deviation, Lanes{}), count);
     }
 }
 

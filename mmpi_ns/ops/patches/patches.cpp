@@ -6,9 +6,6 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#ifdef __AVX2__
-#include <immintrin.h>
-#endif
 
 namespace {
 
@@ -18,18 +15,6 @@ constexpr float LEAST_AHEAD = 1e-6f, LEAST_SHARE = 0.2f, LEAST_SQUARES = PIXELS,
 struct Plane {
     Lanes q, right, down;
 };
-
-// Sixteen numbers of a table.
-IntLanes gather(const int32_t* table, IntLanes at) {
-#ifdef __AVX2__
-    __m256i halves[2];
-    std::memcpy(halves, &at, sizeof at);
-    for (__m256i& half : halves) half = _mm256_i32gather_epi32(table, half, sizeof *table);
-    std::memcpy(&at, halves, sizeof at);
-    return at;
-#endif
-    return each_lane<IntLanes>(at, [table](int32_t i) { return table[i]; });
-}
 
 // Between four bytes: a pixel, the one to its right, and the two below.
 Lanes between(IntLanes corners, Lanes u, Lanes v) {
@@ -72,19 +57,29 @@ struct Other {
         const IntLanes first = level(0), widths = level(2);
         const Lanes last_row = real(level(1)) - 1.0f, last_column = real(widths) - 1.0f;
         const Lanes to_columns = (last_column + 1.0f) / width, to_rows = (last_row + 1.0f) / height;
+        // Places less a half, times the depth: linear in the pixel.
+        const auto numerator = [&](const Lanes* of, int i, Lanes scale) { return of[i] * scale - 0.5f * of[2]; };
+        const Lanes to_x = numerator(right, 0, to_columns), to_y = numerator(right, 1, to_rows);
+        const Lanes down_x = numerator(down, 0, to_columns), down_y = numerator(down, 1, to_rows);
+        const Lanes start_x = numerator(middle, 0, to_columns), start_y = numerator(middle, 1, to_rows);
         Lanes seen[PIXELS], sum{}, nearest = middle[2];
-        for (int n = 0; n < PIXELS; n++) {
-            const float to_right = (n % SIDE - REACH) * stride, to_down = (n / SIDE - REACH) * stride;
-            const Lanes depth = middle[2] + to_right * right[2] + to_down * down[2];
-            nearest = least(nearest, depth);
-            const Lanes inverse = 1.0f / most(depth, splat(1e-12f));
-            Lanes u = (middle[0] + to_right * right[0] + to_down * down[0]) * inverse * to_columns - 0.5f;
-            Lanes v = (middle[1] + to_right * right[1] + to_down * down[1]) * inverse * to_rows - 0.5f;
-            u = pick(shown, least(most(u, Lanes{}), last_column), Lanes{}); // no number where nothing is shown
-            v = pick(shown, least(most(v, Lanes{}), last_row), Lanes{});
-            const IntLanes left = truncated(u), top = truncated(v);
-            seen[n] = between(gather(corners, first + top * widths + left), u - real(left), v - real(top));
-            sum += seen[n];
+        for (int i = 0; i < SIDE; i++) {
+            const float below = (i - REACH) * stride;
+            const Lanes depths = middle[2] + below * down[2];
+            const Lanes row_x = start_x + below * down_x, row_y = start_y + below * down_y;
+#pragma GCC unroll 5
+            for (int j = 0; j < SIDE; j++) {
+                const float beside = (j - REACH) * stride;
+                const Lanes depth = depths + beside * right[2];
+                nearest = least(nearest, depth);
+                const Lanes over = reciprocal(most(depth, splat(1e-12f)));
+                // What is no number, where nothing is shown, becomes 0.
+                const Lanes u = least(most((row_x + beside * to_x) * over, Lanes{}), last_column);
+                const Lanes v = least(most((row_y + beside * to_y) * over, Lanes{}), last_row);
+                const IntLanes left = truncated(u), top = truncated(v);
+                const Lanes value = between(gather(corners, first + top * widths + left), u - real(left), v - real(top));
+                sum += seen[SIDE * i + j] = value;
+            }
         }
         Lanes their_squares{}, product{};
         const Lanes mean = sum * (1.0f / PIXELS);
@@ -94,8 +89,8 @@ struct Other {
             product += value * values[n];
         }
         const Lanes correlation = product / root(most(their_squares * squares, splat(1e-20f)));
-        const Mask counts = (nearest >= LEAST_SHARE * middle[2]) & (their_squares >= LEAST_SQUARES);
-        return pick(shown & counts, correlation, splat(-1));
+        const Lanes textured = pick(their_squares >= LEAST_SQUARES, correlation, splat(-1));
+        return pick(shown, pick(nearest >= LEAST_SHARE * middle[2], textured, splat(-1)), splat(-1));
     }
 };
 
