@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from mmpi_ns.ops.dispatch import in_cpp, operation
+from mmpi_ns.ops.dispatch import operation
 
 ALL = 255
 """Difference from what shows nothing."""
@@ -67,7 +67,7 @@ class Unlike(NamedTuple):
     """Where two do."""
 
 
-@operation()
+@operation(in_cpp=0)
 def compare_colors(color: Int32[Tensor, "H W"], inverse: Float[Tensor, "H W"], layers: Layers, pairs: bool) -> Unlike:
     """Compares the colours of an image with those of others.
 
@@ -105,9 +105,6 @@ def compare_colors(color: Int32[Tensor, "H W"], inverse: Float[Tensor, "H W"], l
             agreed |= agrees
             pair = torch.where(agrees, torch.maximum(pair, torch.minimum(levels[a], levels[other])), pair)
     return Unlike(torch.stack(levels).to(torch.uint8), pair.to(torch.uint8), agreed)
-
-
-in_cpp(compare_colors)
 
 
 def _channels(packed: Tensor) -> Tensor:
