@@ -10,7 +10,7 @@ from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from mmpi_ns.ops.dispatch import in_cpp, operation
+from mmpi_ns.ops.dispatch import operation
 
 WINDOW, LEAST_CONTRAST = 7, 1.0
 """Pixels along the side of the windows that are compared, and the standard deviation of gray levels that a window
@@ -48,7 +48,7 @@ class Compared(NamedTuple):
         return Compared(torch.cat(corners), torch.tensor(sizes), linear, b)
 
 
-@operation()
+@operation(in_cpp=0)
 def correlate_at(
     gray: UInt8[Tensor, "H W"],
     mean: Float[Tensor, "H W"],
@@ -83,9 +83,6 @@ def correlate_at(
         alike = (product - mean * their_mean) / torch.stack(contrasts).clamp(min=LEAST_CONTRAST).prod(0)
         result.append(torch.where(seen > 0, alike, -1.0))
     return torch.stack(result)
-
-
-in_cpp(correlate_at)
 
 
 def _mean(image: Tensor) -> Tensor:

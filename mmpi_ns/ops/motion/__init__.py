@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from mmpi_ns.ops.dispatch import in_cpp, operation
+from mmpi_ns.ops.dispatch import operation
 
 SIDE = 8
 """Pixels along the side of a patch."""
@@ -26,7 +26,7 @@ APART, FARTHEST = 0.25, 8.0
 """Pixels from which on two motions differ, and by which a patch may move on from where it began."""
 
 
-@operation()
+@operation(in_cpp=0)
 def refine_motion(
     gray: UInt8[Tensor, "H W"], other: UInt8[Tensor, "H W"], coarse: Float[Tensor, "A B 2"], stride: int, rounds: int
 ) -> Float[Tensor, "H W 2"]:
@@ -56,9 +56,6 @@ def refine_motion(
         best, least = torch.where((errors < least)[..., None], theirs, best), torch.minimum(errors, least)
     best = torch.where((best != first).any(-1, keepdim=True), patches.descended(best, rounds)[0], best)
     return patches.averaged(best)
-
-
-in_cpp(refine_motion)
 
 
 class _Patches:
