@@ -9,8 +9,10 @@ from torch import Tensor, nn
 
 from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.shading import ColorNetworks
 from mmpi_ns.ops.composite import composite_weights, render_colors
 from mmpi_ns.ops.interpolate import interpolate_densely
+from mmpi_ns.ops.shade import head_colors
 from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.geometry import plane_hits
 
@@ -24,7 +26,8 @@ def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
     assert bundle.nears is not None and bundle.fars is not None
     hits = plane_hits(bundle.origins, bundle.directions, bundle.nears, bundle.fars, field.layout.frames)
     taus, keys, colors = [], [], []
-    count = len(bundle)
+    assert isinstance(field.networks, ColorNetworks)
+    count, networks = len(bundle), field.networks.of_heads(range(len(field.plan.mpis)))
     for k, mpi in enumerate(field.plan.mpis):
         live, u, v, inverse_t = crossings(hits, field.layout.frames, k, mpi.planes)
         planes, (u0, u1, v0, v1) = torch.arange(mpi.planes).expand(count, -1), mpi.extent
@@ -35,8 +38,7 @@ def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
         tau = torch.where(live.reshape(-1), field.layout.optical_depth(k, raw, planes), 0.0)
         chosen = (tau > 1e-4).nonzero()[:, 0]
         features = interpolate_densely(field.features, rows[chosen], weights[chosen])
-        local = hits.local_directions[:, k].repeat_interleave(mpi.planes, 0)[chosen]
-        color = field.networks(k, features, ndc[chosen], local)
+        color = head_colors(networks, k, features, ndc[chosen], hits.local_directions[:, k], chosen // mpi.planes)
         colors.append(torch.zeros(tau.shape[0], 3).index_put((chosen,), color).view(count, -1, 3))
         taus.append(tau.view(count, -1))
         keys.append(torch.where(live, inverse_t, -1.0))

@@ -52,7 +52,7 @@ SECONDS = 0.5
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is."""
-VERSION = 11
+VERSION = 10
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""

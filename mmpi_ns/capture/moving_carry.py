@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from mmpi_ns.capture.dense import mean_and_contrast
+from mmpi_ns.capture.dense import correlation, mean_and_contrast
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, Warp
-from mmpi_ns.capture.moving_sweep import ALIKE, CONTRAST, INSIDE, at_depth, solid
+from mmpi_ns.capture.moving_sweep import ALIKE, CONTRAST, INSIDE, solid
 from mmpi_ns.capture.views import Map
 
 AFTER, STATIC = 2, 4
@@ -47,25 +47,30 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask]) -> M
     view = shot.view.reduced(2)
     size, of_view = view.gray.shape[::-1], mean_and_contrast(view.gray)
     ground = np.asarray(cv2.resize(shot.ground, size, interpolation=cv2.INTER_NEAREST), np.float32)
-    seen = [other.shot.view.reduced(2) for other in others[:STATIC]]
-    compared, images = at_depth(view, of_view, seen), []
-    for there, mask in zip(seen, masks, strict=False):
-        moving = cv2.resize(mask.astype(np.uint8), there.gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        images.append((moving if len(images) < AFTER and moving.any() else None, Warp.between(view, there)))
+    images = []
+    for other, mask in zip(others[:STATIC], masks, strict=False):
+        seen = other.shot.view.reduced(2)
+        shown = np.where(seen.inside, np.maximum(seen.gray, 1), 0).astype(np.uint8)  # 0: nothing
+        moving = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        images.append((shown, moving, Warp.between(view, seen)))
     nearest = float(np.percentile(measured, 98))
     moves, stands = np.full((2, *view.gray.shape), -1, np.float32)
     inverse = np.zeros_like(moves)
     depths = nearest * np.linspace(BEHIND, BEYOND, DEPTHS, dtype=np.float32)
     for q in depths:
         possible = (q >= 0) & (q <= REACH * nearest) & (q >= GROUND * ground - MARGIN * nearest)
-        for (moving, warp), alike in zip(images, compared(q), strict=True):
-            if moving is None:
-                _raise(stands, alike, possible)
+        for n, (shown, moving, warp) in enumerate(images):
+            follows = n < AFTER and moving.any()
+            if not follows and not possible.any():
                 continue
-            x, y, _ = warp.places(np.full_like(moves, q))
+            x, y, ahead = warp.places(np.full_like(moves, q))
+            gray = np.asarray(cv2.remap(shown, x, y, cv2.INTER_LINEAR), np.uint8)
+            alike = correlation(view.gray, gray, of_view)
+            alike[(gray == 0) | (ahead <= 0)] = -1
             is_moving = cv2.remap(moving, x, y, cv2.INTER_NEAREST) > 0
             _raise(stands, alike, possible & ~is_moving)
-            inverse[_raise(moves, alike, is_moving)] = q
+            if follows:
+                inverse[_raise(moves, alike, is_moving)] = q
     coherent = np.abs(inverse - cv2.medianBlur(inverse, 5)) <= COHERENT * (depths[1] - depths[0])
     textured = view.inside & (of_view[1] > CONTRAST)
     whole = solid((moves > ALIKE) & (moves > stands + BETTER) & textured & coherent, ground).astype(np.uint8)

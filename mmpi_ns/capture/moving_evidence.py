@@ -15,16 +15,16 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.views import Map, Parallax, View, pixel_grid
-from mmpi_ns.ops.unlike import ALL, Layers, compare_colors
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
+SAME = 12
+"""Levels by which colours of one surface differ, beyond the range of colours of the pixels around."""
 SPARSE = 2
 """Side of the squares of pixels of which one gives its depth to another image, and which get one depth."""
 SOLID = 0.75
@@ -35,12 +35,15 @@ STEEP = 20.0
 """Degrees between the normal of the ground and up."""
 GROUND_SHARE, BELOW_SHARE = 0.08, 0.03
 """Share of the known depths that lie on the ground, at least, and below it, at most."""
-NEAR = 13
-"""Pixels across which one with a depth stands for those around it."""
+OCCLUDES, NEAR = 1.15, 13
+"""A neighbour shows a point if its inverse depth in a window of this many pixels is the same but for this factor."""
 NEAREST = 95
 """Percentile of an image's inverse depths that stands for the nearest content."""
+CLEARLY, WINDOW = 80, 5
+"""Levels beyond which a larger difference says no more, and side of the window over which differences are averaged."""
 NOISE = 75
 """Percentile of the differences of surfaces of known depth that stands for the noise; some of them move."""
+ALL = 255
 TURNED = 3.0
 """Degrees between the facing directions of two images from which the camera turned between them. Where it goes straight
 on, what neighbours say nothing about is mostly what stands (docs/moving.md)."""
@@ -233,6 +236,40 @@ class Neighbour:
         return layer
 
 
+def _compare(
+    shot: Shot, others: Sequence[Neighbour], layers: Sequence[Bytes], inverse: Map, pairs: bool
+) -> tuple[list[Bytes], Bytes, Mask]:
+    """A shot against its neighbours, with what stands still as a fourth channel, at some inverse depths.
+
+    Returns:
+        Levels by which the colours of each neighbour differ, ALL where it shows nothing. [h, w] each
+        Levels by which the shot differs from both of two neighbours that agree and have nothing in front. [h, w]
+        Where two neighbours do. [h, w]
+    """
+    kernel, four = np.ones((3, 3), np.uint8), cv2.cvtColor(shot.color, cv2.COLOR_BGR2BGRA)
+    nearest, farthest = OCCLUDES * inverse, inverse / OCCLUDES
+    distances, warped, free = [], [], []
+    for other, layer in zip(others, layers, strict=True):
+        x, y, ahead = other.warp.places(inverse)
+        there = cv2.remap(layer, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        inside = (cv2.extractChannel(there, 3) > 0) & (ahead > 0)
+        low, high = cv2.erode(there, kernel), cv2.dilate(there, kernel)
+        apart = most_of_channels(cv2.max(cv2.subtract(low, four), cv2.subtract(four, high)))
+        _, apart = cv2.threshold(apart, CLEARLY, CLEARLY, cv2.THRESH_TRUNC)
+        distances.append(np.asarray(cv2.blur(apart, (WINDOW, WINDOW)), np.uint8) | all_where(~inside))
+        if pairs:
+            theirs = cv2.multiply(cv2.remap(other.shot.around, x, y, cv2.INTER_NEAREST), ahead)
+            free.append(inside & (theirs <= nearest) & (theirs >= farthest))
+            warped.append(there)
+    pair, agreed = np.zeros(inverse.shape, np.uint8), np.zeros(inverse.shape, bool)
+    for a in range(len(warped)):
+        for b in range(max(0, a - 2), a):
+            agree = free[a] & free[b] & (most_of_channels(cv2.absdiff(warped[a], warped[b])) < SAME)
+            agreed |= agree
+            pair = np.maximum(pair, all_where(agree) & np.minimum(distances[a], distances[b]))
+    return distances, pair, agreed
+
+
 def most_of_channels(apart: NDArray[Any]) -> Bytes:
     """The largest of the first three channels; NumPy takes three times as long. [h, w]"""
     blue, green, red = cv2.split(apart)[:3]
@@ -268,20 +305,14 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
         return Evidence(nothing, nothing, nothing, np.ones(shape, bool), 0.0)
     one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
     judged = np.zeros(shape, bool)
-    layers = Layers.of(
-        [torch.from_numpy(other.with_still(mask)) for other, mask in zip(others, masks, strict=True)],
-        [torch.from_numpy(other.shot.around) for other in others],
-        [Parallax.between(shot.view, other.shot.view).tensors for other in others],
-    )
-    color = torch.from_numpy(cv2.cvtColor(shot.color, cv2.COLOR_BGR2BGRA)).view(torch.int32)[..., 0]
+    layers = [other.with_still(mask) for other, mask in zip(others, masks, strict=True)]
     mine, surfaces = possible_depths(shot, others)
     for n, inverse in enumerate(mine + surfaces):
-        compared = compare_colors(color, torch.from_numpy(inverse), layers, n >= len(mine))
-        pair, agreed = compared.pair.numpy(), compared.agreed.numpy()
+        distances, pair, agreed = _compare(shot, others, layers, inverse, n >= len(mine))
         possible = inverse > 0
         if shot.ground is not None:
             possible &= inverse >= SOLID * shot.ground
-        first, second = (levels | all_where(~possible) for levels in two_least(list(compared.levels.numpy())))
+        first, second = (levels | all_where(~possible) for levels in two_least(distances))
         one, two = np.minimum(one, first), np.minimum(two, second)
         behind = np.maximum(behind, pair & all_where(possible))
         judged |= agreed & possible

@@ -8,18 +8,15 @@ hangs in the air. So a shot is compared with its neighbours at inverse depths th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import mean_and_contrast
-from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
-from mmpi_ns.capture.views import Map, Parallax, View
-from mmpi_ns.ops.correlate import Compared, correlate_at
+from mmpi_ns.capture.dense import correlation, mean_and_contrast
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, Warp
+from mmpi_ns.capture.views import Map, View
 
 NEIGHBOURS = 4
 """Nearest neighbours that are compared; the mean of the two best correlations counts at each depth."""
@@ -83,19 +80,21 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
 def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: float) -> tuple[Map, Mask]:
     """The inverse depth at which most is alike, 0 where nothing is, and where only impossible ones are. [h, w] each"""
     shape, of_view = view.gray.shape, mean_and_contrast(view.gray)
-    compared = at_depth(view, of_view, others)
-    # Depths there over depths here, at infinity, at the corners of the view.
-    ends = [(x, y, 1) for x in (0.5, shape[1] - 0.5) for y in (0.5, shape[0] - 0.5)]
-    parallax = [Parallax.between(view, other) for other in others]
+    warps = [Warp.between(view, other) for other in others]
+    grays = [np.where(other.inside, np.maximum(other.gray, 1), 0).astype(np.uint8) for other in others]  # 0: nothing
     least, step = BELOW * ground - MARGIN * largest, largest / POSITIVE
     moves, stands, best = np.full((3, *shape), -1, np.float32)
     inverse, false = np.zeros((2, *shape), np.float32)
     for n in range(-NEGATIVE, POSITIVE + 1):
-        q = n * step
+        q, depths = n * step, np.full(shape, n * step, np.float32)
         first, second = np.full((2, *shape), -1, np.float32)
-        for alike, other in zip(compared(q), parallax, strict=True):
-            if min(ends @ other.linear[2]) + q * other.b[2] <= 0:  # in part behind the other camera
+        for gray, warp in zip(grays, warps, strict=True):
+            x, y, ahead = warp.places(depths)
+            if ahead.min() <= 0:  # in part behind the other camera
                 continue
+            seen = np.asarray(cv2.remap(gray, x, y, cv2.INTER_LINEAR), np.uint8)
+            alike = correlation(view.gray, seen, of_view)
+            alike[seen == 0] = -1
             second = np.maximum(second, np.minimum(first, alike))
             first = np.maximum(first, alike)
         confirmed = (first + second) / 2
@@ -109,22 +108,6 @@ def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: flo
     coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
     textured = view.inside & (of_view[1] > CONTRAST)
     return inverse, (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
-
-
-def at_depth(view: View, of_view: tuple[Map, Map], others: Sequence[View]) -> Callable[[float], NDArray[np.float32]]:
-    """A function of an inverse depth: how alike others are to a view, if all has that. [K, h, w] of them, -1 where they
-    show nothing
-
-    Args:
-        view: the image.
-        of_view: its ``mean_and_contrast``.
-        others: the other images.
-    """
-    grays = [np.where(other.inside, np.maximum(other.gray, 1), 0).astype(np.uint8) for other in others]
-    parallax = [Parallax.between(view, other).tensors for other in others]
-    compared = Compared.of([torch.from_numpy(gray) for gray in grays], parallax)
-    gray, mean, contrast = (torch.from_numpy(part) for part in (view.gray, *of_view))
-    return lambda inverse: correlate_at(gray, mean, contrast, compared, float(inverse)).numpy()
 
 
 def solid(moves: Mask, ground: Map) -> Mask:

@@ -134,6 +134,7 @@ class MMPITrainer(Trainer):
                 torch.cuda.set_device(self.local_rank)
             self._stopped_by: int | None = None
             self._log: TrainingLog | None = None
+            self._began = monotonic()
             config = self.config
             model_config: Any = config.pipeline.model
             model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
@@ -227,7 +228,6 @@ class MMPITrainer(Trainer):
             if self._share.rank == 0:
                 self._write_details(self._total_steps - 1)
             return
-        self._began = monotonic()
         if self._start_step >= self._total_steps:
             self._go_on_after_last_step()
             return
