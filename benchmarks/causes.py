@@ -167,9 +167,9 @@ def markdown(content: Row) -> str:
         lambda r, name: f"{r['pixels'][name]:.0%}, {r['error'][name]:.0%}"
     )
     said = (
-        "Means over test images (and training images). Colours: by the affine map that suits each image best. Pose: "
-        "where the frozen model shows the image best. Training images see a point, by the model's own depth, where "
-        "they show nothing that is more than 5 % nearer."
+        "Means over test images (and training images) of the field alone, without details. Colours: by the affine map "
+        "that suits each image best. Pose: where the frozen model shows the image best. Training images see a point, "
+        "by the model's own depth, where they show nothing that is more than 5 % nearer."
     )
     tables = [table(first, ({"name": n} for n in CAUSES)), table(second, ({"name": n} for n in PARTS))]
     return page("Causes of error", content["made"], said, *tables)
