@@ -15,20 +15,22 @@ class Default:
     """Length of a method's training and its placement, from which the size of texels follows."""
 
     steps: int
-    """Training steps of a small capture."""
+    """Training steps of a capture of ``FEW`` to ``MANY`` pixels."""
+    least_steps: int
+    """Of one of fewer pixels."""
     rays: int
     """Rays of a step."""
     placement: PlacementConfig
 
 
 DEFAULTS = {
-    "mmpi": Default(20000, 4096, PlacementConfig(texel_pixels=1.2, max_texels=200e6)),
-    "mmpi-small": Default(2500, 1024, PlacementConfig(texel_pixels=1.2)),
+    "mmpi": Default(20000, 20000, 4096, PlacementConfig(texel_pixels=1.2, max_texels=200e6)),
+    "mmpi-small": Default(4000, 2500, 1024, PlacementConfig(texel_pixels=1.2)),
 }
-PIXELS = 6.5e6
-"""Training pixels of a window up to which it is a small capture."""
+FEW, MANY = 2.6e6, 10.4e6
+"""Training pixels of a window: below the first steps become fewer in proportion, above the second more."""
 MOST_TIMES = 3.0
-"""Largest multiple of a small capture's steps."""
+"""Largest multiple of the steps."""
 RAYS_PER_PROCESSOR = 256
 """Pixel rays of a step for each multiprocessor of a GPU. By its registers the march has eight programs of 16 rays there
 at a time, so these and the rays of new views are some three rounds of them."""
@@ -58,8 +60,8 @@ def rays_times(method: str, processors: int) -> int:
 def steps_for(method: str, pixels: float, times: int = 1) -> int:
     """Training steps of a window, in hundreds: more for many training pixels, in proportion; fewer if a step draws
     several times the method's rays (``rays_times``)."""
-    multiple = min(max(1.0, pixels / PIXELS), MOST_TIMES)
-    return 100 * round(DEFAULTS[method].steps * multiple / 100) // times
+    default, multiple = DEFAULTS[method], min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES)
+    return 100 * round(max(default.least_steps, default.steps * multiple) / 100) // times
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:

@@ -54,7 +54,7 @@ class MMPITrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: MMPITrainer)
     max_num_iterations: int = 0
     """Steps of the whole run, resumed or not; if a long capture is split into windows, of each window. 0: as many as
-    its pixels need (mmpi-small: 2,500 to 7,500; docs/captures.md)."""
+    its pixels need (mmpi-small: 2,500 to 12,000; docs/captures.md)."""
 
     def set_timestamp(self) -> None:
         """The first code of this package that ns-train runs."""

@@ -13,7 +13,7 @@ from hand_made import make_mpi
 from long_road import road
 from training_runs import datamanager, schedule_of
 
-from mmpi_ns.placement.defaults import DEFAULTS, PIXELS, rays_times, steps_for
+from mmpi_ns.placement.defaults import DEFAULTS, FEW, MANY, rays_times, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import FEWEST, find_balls, most_pixels, of_cameras, place_windows
 from mmpi_ns.scene.plan import ScenePlan
@@ -35,8 +35,8 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     one, windows = PlacementConfig(window_length=0.0), PlacementConfig(window_length=4.0)
     assert most_pixels(few, one) == few.sizes.prod(-1).sum() == most_pixels(few, windows)
     assert 0.05 < most_pixels(many, windows) / many.sizes.prod(-1).sum() < 0.5
-    steps = [steps_for("mmpi-small", pixels) for pixels in (1e4, PIXELS, 2 * PIXELS, 1e12)]
-    assert steps == [2500, 2500, 5000, 7500] and steps_for("mmpi", 1.0) == 20000
+    steps = [steps_for("mmpi-small", pixels) for pixels in (1e4, 0.75 * FEW, FEW, MANY, 2 * MANY, 1e12)]
+    assert steps == [2500, 3000, 4000, 4000, 8000, 12000] and steps_for("mmpi", 1.0) == 20000
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_steps_follow_the_pixels_of_the_largest_window():
 def test_a_larger_gpu_draws_more_rays_a_step_and_as_many_in_all(processors, rays):
     times = rays_times("mmpi", processors)
     assert times * DEFAULTS["mmpi"].rays == rays and rays_times("mmpi-small", processors) in (1, 4)
-    for pixels in (1.0, 4 * PIXELS):
+    for pixels in (1.0, 2.5 * MANY):
         assert times * steps_for("mmpi", pixels, times) == steps_for("mmpi", pixels)
     whole, fewer = (make_schedule(ScheduleConfig(), 2000 // n) for n in (1, times))
     assert [abs(times * a - b) < times for a, b in zip(fewer.growth, whole.growth, strict=True)] == [True] * 4
