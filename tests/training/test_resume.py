@@ -318,6 +318,7 @@ def test_a_run_of_a_device_that_draws_more_rays_is_resumed_with_its_rays_and_ste
 @pytest.mark.parametrize("steps", [0, 150])
 def test_without_a_number_of_steps_they_follow_the_pixels(scene, plan_file, tmp_path, monkeypatch, capsys, steps):
     monkeypatch.setitem(DEFAULTS, "mmpi-small", replace(DEFAULTS["mmpi-small"], steps=100, least_steps=100))
+    monkeypatch.setattr("mmpi_ns.placement.defaults.FEW", 1.0)
     monkeypatch.setattr("mmpi_ns.placement.defaults.MANY", 1.0)
     config = trainer_config(scene, plan_file, tmp_path, steps=steps)
     trainer = ready(config)
