@@ -39,11 +39,8 @@ def refine_motion(
         stride: pixels between patches, at most ``SIDE``.
         rounds: comparisons of a patch, each but the first after a step.
     """
-    patches, (height, width), (small_height, small_width) = (
-        _Patches(gray, other, stride, coarse),
-        gray.shape,
-        coarse.shape[:2],
-    )
+    (height, width), (small_height, small_width) = gray.shape, coarse.shape[:2]
+    patches = _Patches(gray, other, stride, coarse)
     scale = torch.tensor([small_width / width, small_height / height], dtype=coarse.dtype)
     x, y = (((at + SIDE / 2 + 0.5) * of - 0.5) for at, of in zip((patches.columns, patches.rows), scale, strict=True))
     start = _between(coarse, x.expand(patches.shape), y.expand(patches.shape)) / scale
