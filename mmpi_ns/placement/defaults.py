@@ -58,7 +58,7 @@ def rays_times(method: str, processors: int) -> int:
 
 
 def steps_for(method: str, pixels: float, times: int = 1) -> int:
-    """Training steps of a window, in hundreds: fewer for few training pixels, more for many (``FEW``, ``MANY``), each in
+    """Training steps of a window, in hundreds: fewer for few training pixels, more for many (``FEW``, ``MANY``), in
     proportion; fewer, too, if a step draws several times the method's rays (``rays_times``)."""
     default, multiple = DEFAULTS[method], min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES)
     return 100 * round(max(default.least_steps, default.steps * multiple) / 100) // times
