@@ -26,7 +26,7 @@ from report import Row, slug
 from torch import Tensor
 
 from mmpi_ns.bench.gpu import drive
-from mmpi_ns.bench.trainers import P, Scene, Steps, train_words
+from mmpi_ns.bench.trainers import BARE, P, Scene, Steps, train_words
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics
@@ -68,7 +68,7 @@ def steps_of(request: Row, name: str, method: str, options: tuple[str, ...], ste
         torch.cuda.reset_peak_memory_stats()
     scene = Scene(Path(request["data"]), request["downscale_factor"])
     folder = Path(request["work"]) / slug(name, "-")
-    return Steps(train_words(method, options, scene, folder, steps, 0, request["device"]))
+    return Steps(train_words(method, (*BARE, *options), scene, folder, steps, 0, request["device"]))
 
 
 def measure_training(request: Row, tell: Tell) -> Row:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from mmpi_ns.bench.trainers import P, Scene, train_words
+from mmpi_ns.bench.trainers import BARE, P, Scene, train_words
 
 TWO_PHASE = ("--pipeline.model.schedule.training", "two-phase")
 """All rays for each MPI, a little blending, and a long fine-tune at full rates, unless more options follow."""
@@ -71,7 +71,7 @@ class Method:
 
     def words(self, scene: Scene, folder: Path, steps: int, rays: int | None, seed: int, device: str) -> list[str]:
         """``train_words`` of this method; ``rays`` of a step, None leaves them to the method."""
-        options = [*self.options, *self.camera_option]
+        options = [*(BARE if self.ours else ()), *self.options, *self.camera_option]
         if rays is not None and self.batch_option is not None:
             options += [self.batch_option, str(rays)]
         words = train_words(self.registered, options, scene, folder, steps, seed, device)

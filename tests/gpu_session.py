@@ -31,6 +31,8 @@ BENCH_PARTS = ("checks", "training triton")
 """Of ``benchmarks/gpu.py``; trainings to the end come after it."""
 BARE = ("pycolmap", "open3d", "pymeshlab", "wandb", "comet_ml")
 """Packages that the machine is not expected to have."""
+METHODS = ",".join(f"mmpi{n}=mmpi_ns.config:mmpi{n.replace('-', '_')}" for n in ("", "-small", "-kitti"))
+"""For nerfstudio's registry: the package itself is not installed there."""
 TAIL = 6000
 """Characters of what a part prints that are kept."""
 
@@ -52,7 +54,7 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     look = "import platform, torch; print(platform.python_version(), torch.__version__, torch.version.cuda, flush=True)"
     look += "; import triton; print('Triton', triton.__version__, flush=True)"
     look += "; import nerfstudio.configs.method_configs, mmpi_ns.config; print('nerfstudio and mmpi_ns import')"
-    small = ["--rehearse", "--parts", "checks"] if rehearse else ["--data", str(data), "--parts", *BENCH_PARTS]
+    small = ["--data", str(data), *(["--rehearse", "--parts", "checks"] if rehearse else ["--parts", *BENCH_PARTS])]
     return [
         Part("device", ["nvidia-smi"], 20),
         Part("environment", [*python, "-c", look], 90),
@@ -135,8 +137,9 @@ def main() -> int:
     out, start = given.out.resolve(), time.monotonic()
     (out / "logs").mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix="gpu-session-"))  # checkpoints are too large to bring back
-    data = (given.data or work / "quick" / "street").resolve()  # which the quick look makes
+    data = (given.data or work / "quick" / "noise").resolve()  # which the quick look makes
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    os.environ["NERFSTUDIO_METHOD_CONFIGS"] = METHODS
     if given.rehearse:
         strip(work / "bare")
     todo = [p for p in parts(data, out, work, given.rehearse) if given.only is None or p.name in given.only]

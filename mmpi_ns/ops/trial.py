@@ -23,6 +23,7 @@ from mmpi_ns.ops.march import MarchOptions, Rays
 from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 from mmpi_ns.scene.texels import BRICK, make_grids
+from mmpi_ns.utils.parallel import in_order
 
 CLOSE = 1e-3
 """Largest difference relative to the largest number: a wrong kernel is off by more, another order of sums by less."""
@@ -43,8 +44,10 @@ class Disagreement(Exception):
 def run(name: str, device: str, shapes: Shapes = SMALL) -> None:
     """Tries one operation on a device. Raises Disagreement if the results differ, or whatever Triton, its compiler or
     the driver finds amiss."""
-    for arguments in CASES[name](device, shapes):
-        kernel = _outcome(name, "gpu", arguments)
+    cases = CASES[name](device, shapes)
+    # Kernels compile side by side: Triton's passes hold no lock of Python. Its interpreter runs one at a time.
+    outcomes = (map if dispatch.interpreting else in_order)(lambda arguments: _outcome(name, "gpu", arguments), cases)
+    for arguments, kernel in zip(cases, list(outcomes), strict=True):
         with dispatch.chosen("torch"):
             reference = _outcome(name, "reference", arguments)
         for a, b in zip(kernel, reference, strict=True):

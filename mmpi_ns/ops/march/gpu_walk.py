@@ -241,7 +241,7 @@ def _choose(first, count, done, u, bend_u, v, bend_v, oz, dz, constants, cube, K
     heads, numbers = tl.zeros([RAYS, STEPS], tl.int32), tl.zeros([RAYS, STEPS], tl.int32)
     inverse_ts = tl.full([RAYS, STEPS], -1.0, tl.float32)
     us, bends_u, vs, bends_v = inverse_ts * 0, inverse_ts * 0, inverse_ts * 0, inverse_ts * 0
-    for i in tl.static_range(STEPS):
+    for i in range(STEPS):
         next_ones = tl.where(is_mpi, first - done, first + done)  # m of a plane, or number of the cube's sample
         w = next_ones.to(tl.float32) * step + end
         distances = w * dz / (1 - w * oz)
