@@ -131,8 +131,8 @@ def _marches(device: str, shapes: Shapes, many: bool | None = None) -> list[tupl
     counts = (RAYS, MANY_RAYS) if (device == "cuda" if many is None else many) else (RAYS,)
     cases = []
     for mpis in shapes.mpis:
-        # Many are all kept: some sample would weigh what the threshold says.
-        ways = [(count, MarchOptions(0.02 / max(mpis, 2) if count == RAYS else 0.0)) for count in counts]
+        # Of many rays some sample would weigh what a threshold of use says: they keep all that weighs anything.
+        ways = [(count, MarchOptions(0.02 / max(mpis, 2) if count == RAYS else 1e-30)) for count in counts]
         ways += [(count, options._replace(blends=True)) for count, options in ways] if shapes.blends else []
         layout, tables = _scene(device, shapes.cube, mpis)
         cases += [
