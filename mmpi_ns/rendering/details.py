@@ -218,8 +218,7 @@ def write_details(
     Raises:
         WriteError: the disk is full.
     """
-    kinds = cameras.camera_type.reshape(-1)
-    if not bool(torch.isin(kinds, torch.tensor([CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value])).all()):
+    if not {*cameras.camera_type.flatten().tolist()} <= {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value}:
         return "Images show the field without details: some cameras are neither perspective nor fisheye."
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CAMERAS_FILE).unlink(missing_ok=True)

@@ -90,7 +90,7 @@ def tiles_with_copies(
     Returns:
         Tiles of the copies, and of all heads.
     """
-    stored, fine = grids[0].tiles > 0, torch.zeros_like(copies[0].tiles, dtype=torch.bool)
+    stored, fine = grids[0].tiles > 0, stored.new_zeros(len(copies[0].tiles))
     kept = stored.clone()
     for grid, copy in zip(grids, copies, strict=False):
         here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
