@@ -218,7 +218,8 @@ def write_details(
     Raises:
         WriteError: the disk is full.
     """
-    if not {*cameras.camera_type.flatten().tolist()} <= {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value}:
+    kinds = cameras.camera_type.flatten().tolist()
+    if not set(kinds) <= {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value}:
         return "Images show the field without details: some cameras are neither perspective nor fisheye."
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CAMERAS_FILE).unlink(missing_ok=True)
@@ -239,7 +240,7 @@ def write_details(
         path = folder / f"{i:05d}.npz"
         write_atomically(path, partial(_save, arrays))
         size += path.stat().st_size
-        rows.append(_camera_row(cameras[i], bundle, int(kinds[i]) == CameraType.FISHEYE.value))
+        rows.append(_camera_row(cameras[i], bundle, kinds[i] == CameraType.FISHEYE.value))
     write_atomically(folder / CAMERAS_FILE, partial(_save, {"step": np.array(step), "cameras": np.stack(rows)}))
     return f"Details of {len(rows)} training images, {size / 2**20:,.0f} MiB, are in {folder}."
 

@@ -90,7 +90,8 @@ def tiles_with_copies(
     Returns:
         Tiles of the copies, and of all heads.
     """
-    stored, fine = grids[0].tiles > 0, stored.new_zeros(len(copies[0].tiles))
+    stored = grids[0].tiles > 0
+    fine = stored.new_zeros(len(copies[0].tiles))
     kept = stored.clone()
     for grid, copy in zip(grids, copies, strict=False):
         here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
