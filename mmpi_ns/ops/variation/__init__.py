@@ -35,8 +35,7 @@ def total_variation(
         inside = grid.holds(rows).nonzero()[:, 0]
         neighbours, exists = grid.neighbours(rows[inside])
         weights = exists * each.repeat_interleave(2)
-        around = table[neighbours.reshape(-1)].view(*neighbours.shape, -1)
-        total = total + clamped_differences(values[inside], around, weights)
+        total = total + clamped_differences(values[inside], table[neighbours], weights)
     return total
 
 
