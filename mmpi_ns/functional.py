@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -85,36 +86,30 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
     folder = path.parent if path.is_file() else path
     if (folder / HEADER).is_file():
         baked = read_baked(folder)
-        lenses = torch.tensor([(*pose.focal, *pose.center) for pose in baked.path])
-        poses, sizes = torch.tensor([pose.to_world for pose in baked.path]), torch.tensor([p.size for p in baked.path])
-        names = WindowedPlan(tuple(place for place, _ in baked.windows)).names
-        views = CameraPath(poses, _intrinsics(lenses), sizes)
-        return Scene(names, views, device, lambda camera: baked.image(image_rays(camera.to("cpu"))))
-    if not (folder / "config.yml").is_file():
+        rows = [[*chain(*pose.to_world), *pose.focal, *pose.center, *pose.size] for pose in baked.path]
+        cameras, windows = torch.tensor(rows), WindowedPlan(tuple(place for place, _ in baked.windows))
+        names, image_of = windows.names, lambda camera: baked.image(image_rays(camera.to("cpu")))
+    elif (folder / "config.yml").is_file():  # the model of a run with its last checkpoint, without a data manager
+        config = read_run_config(folder / "config.yml")
+        state = read_checkpoint(last_checkpoint(folder / "nerfstudio_models"))
+        cameras = state["capture"]["cameras"]
+        config.windows_folder, config.rendering.mode = folder / "windows", "exact"
+        unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
+        tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
+        model.load_state_dict(tensors)
+        model.update_to_step(state["step"])
+        model.eval()
+        names, image_of = model.progress.windows.names, model.get_outputs_for_camera
+    else:
         raise InputError(
             f"There is no scene at {path}: give the folder of a run (with config.yml), or one that mmpi-export bake or "
             f"mmpi-export web wrote (with {HEADER})."
         )
-    # The model of a run with its last checkpoint, without a data manager.
-    config = read_run_config(folder / "config.yml")
-    state = read_checkpoint(last_checkpoint(folder / "nerfstudio_models"))
-    cameras = state["capture"]["cameras"]
-    config.windows_folder, config.rendering.mode = folder / "windows", "exact"
-    unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
-    model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
-    tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
-    model.load_state_dict(tensors)
-    model.update_to_step(state["step"])
-    model.eval()
-    views = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(cameras[:, 12:16]), cameras[:, 16:].long())
-    return Scene(model.progress.windows.names, views, device, model.get_outputs_for_camera)
-
-
-def _intrinsics(numbers: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    """Matrices of focal lengths and principal points (fx, fy, cx, cy)."""
-    matrices = torch.eye(3).repeat(len(numbers), 1, 1)
-    matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]] = numbers
-    return matrices
+    intrinsics = torch.eye(3).repeat(len(cameras), 1, 1)
+    intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]] = cameras[:, 12:16]
+    views = CameraPath(cameras[:, :12].view(-1, 3, 4), intrinsics, cameras[:, 16:].long())
+    return Scene(names, views, device, image_of)
 
 
 @torch.no_grad()

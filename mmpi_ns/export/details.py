@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
@@ -91,7 +91,3 @@ def restored_view(view: StoredView, device: torch.device) -> DetailView:
 
 def _pixels(data: bytes) -> UInt8[NDArray[np.uint8], "H W 3"]:
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-
-
-def cameras_of(views: tuple[StoredView, ...]) -> Float[Tensor, "N 24"]:
-    return torch.tensor([view.camera for view in views])

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.rays import CameraRays
 from mmpi_ns.export.codes import coarse_differences, split_codes
-from mmpi_ns.export.details import STEP, StoredView, cameras_of, restored_view
+from mmpi_ns.export.details import STEP, StoredView, restored_view
 from mmpi_ns.ops.baked import reader
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.details import Details, DetailView
@@ -91,7 +91,7 @@ class BakedScene:
                     f"Details of training image {i} are damaged ({error}): bake the scene again."
                 ) from error
 
-        return Details(cameras_of(self.views), read)
+        return Details(torch.tensor([view.camera for view in self.views]), read)
 
     def image(self, bundle: RayBundle) -> dict[str, Tensor]:
         """Outputs of an image's rays [H, W], as of the model: with details, where there are some."""
@@ -125,7 +125,8 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
     # Details of training images are kept with the window that they stand nearest to.
     views: list[list[StoredView]] = [[] for _ in scene.windows]
     if scene.views:
-        shares = window_shares(cameras_of(scene.views)[:, [3, 7, 11]], tuple(place for place, _ in scene.windows))
+        centers = torch.tensor([view.camera for view in scene.views])[:, [3, 7, 11]]
+        shares = window_shares(centers, tuple(place for place, _ in scene.windows))
         for view, number in zip(scene.views, shares.argmax(-1).tolist(), strict=True):
             views[number].append(view)
     rows = [_write_window(folder / f"window-{i:05d}.bin", *window, views[i]) for i, window in enumerate(scene.windows)]
@@ -203,7 +204,13 @@ def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
     }
     beside_bricks = sum(len(_gzip(array)) for array in others.values())  # the first part has columns too
     room = EARLY * (len(_gzip(coarse_differences(coarse))) + len(_gzip(fine)) + beside_bricks + behind) - beside_bricks
-    early = _early(window, coarse, room)
+    # The bricks whose coarse codes come first: those that training views see most of, as many as fit into the room.
+    count = mpis.num_bricks
+    order = torch.arange(count) if window.seen is None else window.seen.argsort(descending=True, stable=True)
+    thousandth = torch.empty_like(order).index_copy(0, order, 1000 * torch.arange(count) // max(count, 1))
+    early = thousandth < bisect_right(
+        range(1, 1000), room, key=lambda n: len(_gzip(coarse_differences(coarse[:, (thousandth < n).numpy()])))
+    )
     return {
         "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
         "early": coarse_differences(coarse[:, early.numpy()]),
@@ -211,23 +218,6 @@ def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
         "late": coarse_differences(coarse[:, ~early.numpy()]),
         "fine": fine,
     }
-
-
-def _early(window: BakedWindow, coarse: NDArray[np.uint8], room: float) -> Bool[Tensor, "B"]:
-    """The bricks whose coarse codes come first: those that training views see most of, as many as fit into so many
-    bytes."""
-    count = window.mpis.num_bricks
-    order = torch.arange(count) if window.seen is None else window.seen.argsort(descending=True, stable=True)
-
-    def first(thousandths: int) -> Bool[Tensor, "B"]:
-        early = torch.zeros(count, dtype=torch.bool)
-        early[order[: -(-count * thousandths // 1000)]] = True
-        return early
-
-    def size(thousandths: int) -> int:
-        return len(_gzip(coarse_differences(coarse[:, first(thousandths).numpy()])))
-
-    return first(bisect_right(range(1, 1000), room, key=size))
 
 
 def _gzip(array: NDArray[Any]) -> bytes:
