@@ -115,8 +115,37 @@ class ScenePlan:
         """Raises InputError with one sentence that names the MPI and the field that cannot be used."""
         if not self.mpis:
             raise InputError("A scene plan needs at least one MPI, this one has none: add one to its list 'mpis'.")
-        for i, mpi in enumerate(self.mpis):
-            _validate_mpi(mpi, _mpi_name(mpi, i))
+        for number, mpi in enumerate(self.mpis):
+            where = _mpi_name(mpi, number)
+            check_text(f"The name of {where}", mpi.name)
+            check_row(f"The 'origin' of {where}", mpi.origin, 3, LENGTH)
+            check_number(f"The 'near' of {where}", mpi.near, Number(1 / HUGE, HUGE))
+            check_row(f"The 'extent' of {where}", mpi.extent, 4, Number(-WIDEST, WIDEST))
+            check_number(f"The 'planes' of {where}", mpi.planes, Number(2, MOST_PLANES, whole=True))
+            for name in ("height", "width"):
+                check_number(
+                    f"The '{name}' (texels) of {where}", getattr(mpi, name), Number(2, MOST_TEXELS, whole=True)
+                )
+            if not isinstance(mpi.axes, (list, tuple)) or len(mpi.axes) != 3:
+                raise InputError(f"The 'axes' of {where} must be three rows of three numbers, not {shown(mpi.axes)}.")
+            for i, row in enumerate(mpi.axes):
+                check_row(f"Row {i + 1} of the 'axes' of {where}", row, 3, Number(-2, 2))
+            dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in mpi.axes for q in mpi.axes]
+            if max(abs(d - float(i % 4 == 0)) for i, d in enumerate(dots)) > 1e-4:
+                raise InputError(f"The axes of {where} are not orthonormal: give three perpendicular unit rows.")
+            (a, b, c), (d, e, f), (g, h, i) = mpi.axes
+            if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
+                raise InputError(
+                    f"The axes of {where} are left-handed: negate one row, or give x right, y down, z facing."
+                )
+            u0, u1, v0, v1 = mpi.extent
+            if u0 >= u1 or v0 >= v1:
+                raise InputError(f"{where} needs an 'extent' (u0, u1, v0, v1) with u0 < u1 and v0 < v1.")
+            far = mpi.far
+            if far != math.inf and not Number(SHALLOWEST * mpi.near, HUGE).holds(far):
+                raise InputError(
+                    f"{where} needs a 'far' beyond its 'near', or null in 'far' for infinity, not {shown(far)}."
+                )
         if self.cube is not None:
             for name in ("lower", "upper"):
                 check_row(f"The '{name}' of the plan's cube", getattr(self.cube, name), 3, LENGTH)
@@ -209,32 +238,6 @@ class ScenePlan:
 def _mpi_name(mpi: Any, index: int) -> str:
     name = mpi.get("name") if isinstance(mpi, dict) else getattr(mpi, "name", None)
     return f"MPI {shown(name)}" if isinstance(name, str) and name else f"MPI number {index + 1}"
-
-
-def _validate_mpi(mpi: MPIPlan, where: str) -> None:
-    check_text(f"The name of {where}", mpi.name)
-    check_row(f"The 'origin' of {where}", mpi.origin, 3, LENGTH)
-    check_number(f"The 'near' of {where}", mpi.near, Number(1 / HUGE, HUGE))
-    check_row(f"The 'extent' of {where}", mpi.extent, 4, Number(-WIDEST, WIDEST))
-    check_number(f"The 'planes' of {where}", mpi.planes, Number(2, MOST_PLANES, whole=True))
-    for name in ("height", "width"):
-        check_number(f"The '{name}' (texels) of {where}", getattr(mpi, name), Number(2, MOST_TEXELS, whole=True))
-    if not isinstance(mpi.axes, (list, tuple)) or len(mpi.axes) != 3:
-        raise InputError(f"The 'axes' of {where} must be three rows of three numbers, not {shown(mpi.axes)}.")
-    for i, row in enumerate(mpi.axes):
-        check_row(f"Row {i + 1} of the 'axes' of {where}", row, 3, Number(-2, 2))
-    dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in mpi.axes for q in mpi.axes]
-    if max(abs(d - float(i % 4 == 0)) for i, d in enumerate(dots)) > 1e-4:
-        raise InputError(f"The axes of {where} are not orthonormal: give three perpendicular unit rows.")
-    (a, b, c), (d, e, f), (g, h, i) = mpi.axes
-    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
-        raise InputError(f"The axes of {where} are left-handed: negate one row, or give x right, y down, z facing.")
-    u0, u1, v0, v1 = mpi.extent
-    if u0 >= u1 or v0 >= v1:
-        raise InputError(f"{where} needs an 'extent' (u0, u1, v0, v1) with u0 < u1 and v0 < v1.")
-    far = mpi.far
-    if far != math.inf and not Number(SHALLOWEST * mpi.near, HUGE).holds(far):
-        raise InputError(f"{where} needs a 'far' beyond its 'near', or null in 'far' for infinity, not {shown(far)}.")
 
 
 def read_object(text: str) -> dict:

@@ -230,7 +230,16 @@ class MMPITrainer(Trainer):
                 self._write_details(self._total_steps - 1)
             return
         if self._start_step >= self._total_steps:
-            self._go_on_after_last_step()
+            # A finished run lacks its details where it was stopped meanwhile.
+            self._last_step = self._start_step - 1
+            shows_details = cast(Any, self.pipeline.model).config.rendering.nearest_images
+            is_last = self._start_step == self._total_steps
+            lacks = is_last and shows_details and self._last_step in checkpoints_in(self.checkpoint_dir)
+            lacks = lacks and not has_details(self.base_dir / DETAILS_FOLDER, self._last_step)
+            left = "details of its training images are made" if lacks else "nothing to do"
+            say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
+            if lacks:
+                self._complete()
             return
 
         def stop(number: int) -> None:  # nerfstudio's loop ends after the current step, even if training is paused
@@ -318,17 +327,6 @@ class MMPITrainer(Trainer):
             if self._says_lines and images is not None:
                 say(quick_test(self.pipeline.model, images))
         say(next_commands(self.base_dir))
-
-    def _go_on_after_last_step(self) -> None:
-        """Makes the details that a finished run in this folder lacks, as it was stopped meanwhile."""
-        model, self._last_step = cast(Any, self.pipeline.model), self._start_step - 1
-        is_whole = self._start_step > self._total_steps or self._last_step not in checkpoints_in(self.checkpoint_dir)
-        is_whole = is_whole or not model.config.rendering.nearest_images
-        is_whole = is_whole or has_details(self.base_dir / DETAILS_FOLDER, self._last_step)
-        left = "nothing to do" if is_whole else "details of its training images are made"
-        say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
-        if not is_whole:
-            self._complete()
 
     def _write_details(self, step: int) -> None:
         """Keeps what the trained field lacks in its training images, if it is to be shown, as it is from now on."""
