@@ -120,7 +120,14 @@ def objects_in(shot: Half, other: Half) -> list[tuple[int, Mask]]:
         outline = cv2.resize(shape.astype(np.uint8), None, fx=size, fy=size, interpolation=cv2.INTER_NEAREST)
         before = np.array([columns.mean(), rows.mean()])
         middle = (before - (left, top)) * size + (first, above)
-        if _may_stand(shot, warp, middle, before, above + len(outline) - 1):
+        # Something static at one of the depths that it can have may be there and here.
+        last = np.array([width - 1, height - 1])
+        (column, row), was = (np.clip(at, 0, last).astype(int) for at in (middle, before))
+        least = SOLID * float(shot.ground[min(above + len(outline), height) - 1, column])
+        inverse = np.linspace(least, max(least, REACH * shot.nearest), DEPTHS, dtype=np.float32)[:, None]
+        x, y, ahead = warp.at((np.array([row]), np.array([column])), DEPTHS).places(inverse)
+        far_x, far_y, _ = warp.at((was[1:], was[:1]), 1).places(np.zeros((1, 1), np.float32))
+        if (np.hypot(x - far_x, y - far_y)[ahead > 0] < APART).any():
             continue
         part = np.zeros((height, width), np.uint8)
         part[above : above + outline.shape[0], first : first + outline.shape[1]] = outline
@@ -157,24 +164,3 @@ def search(image: Bytes, color: Bytes, shape: Mask, corner: tuple[int, int]) -> 
         if alike[row, column] > best:
             best, place = float(alike[row, column]), (size, first + int(column), above + int(row))
     return place
-
-
-def _may_stand(shot: Half, warp: Warp, here: NDArray[np.float64], there: NDArray[np.float64], bottom: int) -> bool:
-    """Whether something static may be at one pixel of a shot and at another one of a neighbour that is turned alike.
-
-    Args:
-        shot: the image.
-        warp: to the neighbour.
-        here: column and row of the middle of an object in the shot.
-        there: column and row in the neighbour, turned alike.
-        bottom: last row of the object in the shot.
-    """
-    height, width = shot.view.gray.shape
-    (column, row), before = (
-        tuple(int(np.clip(c, 0, n - 1)) for c, n in zip(at, (width, height), strict=True)) for at in (here, there)
-    )
-    least = SOLID * float(shot.ground[min(bottom, height - 1), column])
-    inverse = np.linspace(least, max(least, REACH * shot.nearest), DEPTHS, dtype=np.float32)[:, None]
-    x, y, ahead = warp.at((np.array([row]), np.array([column])), DEPTHS).places(inverse)
-    was = warp.at((np.array([before[1]]), np.array([before[0]])), 1).places(np.zeros((1, 1), np.float32))
-    return bool((np.hypot(x - was[0], y - was[1])[ahead > 0] < APART).any())

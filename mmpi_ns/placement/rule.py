@@ -243,7 +243,15 @@ class _Choice:
             if not allowed.any():
                 break
             best = int(np.where(allowed, more / self.price, -1.0).argmax())
-            grown = self._without_superfluous([*chosen, best])
+            grown = [*chosen, best]
+            while True:  # without the heads whose absence costs less than the minimum gain, one by one
+                total, mpis = self._total(grown), int((~self.is_cube[grown]).sum())
+                losses = [self._total([c for c in grown if c != j]) - total for j in grown]
+                free = [n for n, j in enumerate(grown) if self.is_cube[j] or mpis > 1]
+                least = min(free, key=losses.__getitem__, default=None)
+                if least is None or losses[least] >= self.config.min_gain:
+                    break
+                del grown[least]
             if self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
                 break
             chosen = grown
@@ -257,18 +265,6 @@ class _Choice:
         """Remaining expected error, in bits, summed over images."""
         served = np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
         return float(served @ self.weights)
-
-    def _without_superfluous(self, chosen: list[int]) -> list[int]:
-        """Removes, one by one, heads whose absence costs less than the minimum gain."""
-        while True:
-            total = self._total(chosen)
-            losses = [self._total([c for c in chosen if c != j]) - total for j in chosen]
-            mpis = int((~self.is_cube[chosen]).sum())
-            free = [n for n, j in enumerate(chosen) if self.is_cube[j] or mpis > 1]
-            least = min(free, key=lambda n: losses[n], default=None)
-            if least is None or losses[least] >= self.config.min_gain:
-                return chosen
-            chosen = [j for n, j in enumerate(chosen) if n != least]
 
 
 def widened(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoints) -> list[MPIPlan]:

@@ -141,30 +141,26 @@ class Details:
 
 def read_details(folder: Path) -> tuple[int, Details]:
     """What ``write_details`` has written, and the step of its checkpoint. Raises InputError if it is damaged."""
-    try:
-        with np.load(folder / CAMERAS_FILE) as file:
-            step, cameras = int(file["step"]), torch.from_numpy(file["cameras"])
-    except DAMAGED as error:
-        raise _damaged(folder / CAMERAS_FILE, error) from error
+    step, cameras = _load(folder / CAMERAS_FILE, "step", "cameras")
 
     def read(i: int, device: torch.device) -> DetailView:
-        path = folder / f"{i:05d}.npz"
-        try:
-            with np.load(path) as file:
-                difference, inverse = (torch.from_numpy(file[name]).to(device) for name in ("difference", "inverse"))
-        except DAMAGED as error:
-            raise _damaged(path, error) from error
+        difference, inverse = (x.to(device) for x in _load(folder / f"{i:05d}.npz", "difference", "inverse"))
         image = torch.cat([difference.float() * (LARGEST / LEVELS), inverse.float()[..., None]], -1)
         return DetailView(image, cameras[i].to(device))
 
-    return step, Details(cameras, read)
+    return int(step), Details(cameras, read)
 
 
-def _damaged(path: Path, error: Exception) -> InputError:
-    return InputError(
-        f"{path} is damaged ({brief(error)}): remove the folder {path.parent}, and images show the field alone, or "
-        "train again."
-    )
+def _load(path: Path, *names: str) -> list[Tensor]:
+    """Some arrays of a file. Raises InputError if it is damaged."""
+    try:
+        with np.load(path) as file:
+            return [torch.from_numpy(file[name]) for name in names]
+    except DAMAGED as error:
+        raise InputError(
+            f"{path} is damaged ({brief(error)}): remove the folder {path.parent}, and images show the field alone, or "
+            "train again."
+        ) from error
 
 
 def has_details(folder: Path, step: int) -> bool:

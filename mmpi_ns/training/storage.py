@@ -72,14 +72,8 @@ def prepare_storage(
 
 
 def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any, Any]]) -> None:
-    """Makes texels finer than planned where bricks were released: as fine as the plan allows within its bytes.
-
-    Args:
-        field: the field that is trained.
-        work: what is trained.
-        budget: bytes of tables and moments.
-        trained: optimisers and their tables.
-    """
+    """Makes texels finer than planned where bricks were released: as fine as the plan allows within ``budget`` bytes of
+    tables and moments. ``trained`` are optimisers and their tables."""
     plan = field.full_plan
 
     def bytes_of(tiles: Tensor) -> int:
@@ -103,15 +97,8 @@ def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any,
 def copy_finely(
     field: TexelTables, gain: Float[Tensor, "B"], work: Work, budget: int, trained: list[tuple[Any, Any]]
 ) -> None:
-    """Gives MPIs finer copies of the bricks in which training rays have the largest errors, and of those beside them.
-
-    Args:
-        field: the field that is trained, without copies.
-        gain: of each brick (``TexelTables.gain``).
-        work: what is trained.
-        budget: bytes of tables and moments.
-        trained: optimisers and their tables.
-    """
+    """Gives MPIs, which have none yet, finer copies of the bricks in which training rays have the largest errors
+    (``TexelTables.gain``), and of those beside them. Arguments are those of ``refine``."""
     grids, copies = field.grids, field.copy_grids()
     first_voxel = sum(grid.own_tiles.numel() for grid in grids[: len(copies)])
     order = gain[1:].argsort(descending=True, stable=True) + 1

@@ -48,7 +48,9 @@ def refine_motion(
     best = first
     for shift in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         theirs = first.roll(shift, (0, 1))
-        is_other = ((theirs - first).square().sum(-1) > APART**2) & patches.has(shift)
+        rows, columns = (torch.arange(n) - by for n, by in zip(patches.shape, shift, strict=True))
+        exists = ((rows >= 0) & (rows < patches.shape[0]))[:, None] & (columns >= 0) & (columns < patches.shape[1])
+        is_other = ((theirs - first).square().sum(-1) > APART**2) & exists
         errors = torch.where(is_other, patches.compare(theirs)[0], torch.inf)
         best, least = torch.where((errors < least)[..., None], theirs, best), torch.minimum(errors, least)
     best = torch.where((best != first).any(-1, keepdim=True), patches.descended(best, rounds)[0], best)
@@ -73,11 +75,6 @@ class _Patches:
         self.shape = self.gray.shape[:2]
         self.rows, self.columns = (stride * torch.arange(n) for n in self.shape)
         self.rows = self.rows[:, None]
-
-    def has(self, shift: tuple[int, int]) -> Tensor:
-        """Whether there is a patch before each one in this direction."""
-        rows, columns = (torch.arange(n) - by for n, by in zip(self.shape, shift, strict=True))
-        return ((rows >= 0) & (rows < self.shape[0]))[:, None] & (columns >= 0) & (columns < self.shape[1])
 
     def differences(self, motion: Tensor) -> Tensor:
         height, width = self.size
