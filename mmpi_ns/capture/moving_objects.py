@@ -167,15 +167,26 @@ def room_of(shot: Shot, judged: Mask, part: Mask) -> tuple[tuple[int, int, int, 
 
 
 def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int, int, int, int], body: int) -> Mask:
-    """The object that covers some pixels for certain and others in its room perhaps."""
+    """The object that covers some pixels for certain and others in its room perhaps: by GrabCut, and with its body."""
     height, (left, top, right, bottom) = len(part), room
     margin = max(8, round(0.3 * max(right - left, bottom - max(0, top))))
     inside = np.s_[max(0, top - margin) : bottom + margin, max(0, left - margin) : right + margin]
     perhaps = np.zeros_like(part)
     perhaps[max(0, top) : bottom, max(0, left) : right] = True
     perhaps &= ~static
+    (rows, columns), shrink = part[inside].shape, 2 if part[inside].size > LARGE else 1
+    images = shot.color[inside], part[inside].astype(np.uint8) * ALL, perhaps[inside].astype(np.uint8) * ALL
+    color, surely, maybe = (
+        cv2.resize(image, (columns // shrink, rows // shrink), interpolation=cv2.INTER_AREA) for image in images
+    )
+    labels = np.where(surely > 0, cv2.GC_FGD, np.where(maybe > ALL // 2, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(np.uint8)
+    if (labels == cv2.GC_BGD).any():
+        cv2.setRNGSeed(0)
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(color, labels, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
+    cut = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.float32)
     result = part.copy()
-    result[inside] |= perhaps[inside] & _cut(shot.color[inside], part[inside], perhaps[inside])
+    result[inside] |= perhaps[inside] & (cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_LINEAR) > 0.5)
     # The colours of an object may be those around it; what stands in the columns above its seeds is its body.
     columns_of = part.any(0)
     first, last = part.argmax(0), height - 1 - part[::-1].argmax(0)
@@ -188,24 +199,6 @@ def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int,
     _, labels = cv2.connectedComponents(outside.astype(np.uint8), connectivity=4)
     whole = (labels != labels[0, 0])[1:-1, 1:-1]
     return whole if part.sum() > CORE * (whole.sum() + (whole & judged).sum()) / 2 else np.zeros_like(whole)
-
-
-def _cut(color: NDArray[np.uint8], surely: Mask, perhaps: Mask) -> Mask:
-    """What GrabCut takes for an object; at half the size if it is large. [h, w]"""
-    size = color.shape[1::-1]
-    if surely.size > LARGE:
-        size = size[0] // 2, size[1] // 2
-    small, part, room = (
-        cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        for image in (color, surely.astype(np.uint8) * ALL, perhaps.astype(np.uint8) * ALL)
-    )
-    labels = np.where(part > 0, cv2.GC_FGD, np.where(room > ALL // 2, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(np.uint8)
-    if (labels == cv2.GC_BGD).any():
-        cv2.setRNGSeed(0)
-        models = np.zeros((1, 65)), np.zeros((1, 65))
-        cv2.grabCut(small, labels, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
-    objects = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.float32)
-    return cv2.resize(objects, surely.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> Mask:

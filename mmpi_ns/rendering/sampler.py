@@ -1,7 +1,4 @@
-"""Sample and merge: each ray is sampled in every MPI, the samples are merged by distance (paper sec. III-B).
-
-The march has no gradients. The field later differentiates through the samples that were kept.
-"""
+"""What the march (``ops/march``) is asked for: rays, and which of their samples train (paper sec. III-B)."""
 
 from __future__ import annotations
 

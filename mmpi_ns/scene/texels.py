@@ -122,12 +122,7 @@ def _cell(coordinate: Float[Tensor, "N"], size: int) -> tuple[Int[Tensor, "N"], 
 
 
 def head_grids(plan: ScenePlan, tiles: Int[Tensor, "T"] | None = None) -> list[TexelGrid]:
-    """The texels of every head, MPIs first, the cube last.
-
-    Args:
-        plan: sizes of the heads.
-        tiles: brick of every tile; None stores all of them in order.
-    """
+    """The texels of every head, MPIs first, the cube last. ``tiles``: None stores all of them in order."""
     return make_grids(head_shapes(plan), tiles, plan.cube is not None)
 
 
