@@ -1,4 +1,7 @@
-"""What the march (``ops/march``) is asked for: rays, and which of their samples train (paper sec. III-B)."""
+"""Sample and merge: each ray is sampled in every MPI, the samples are merged by distance (paper sec. III-B).
+
+The march has no gradients. The field later differentiates through the samples that were kept.
+"""
 
 from __future__ import annotations
 
