@@ -75,7 +75,7 @@ class Method:
         if rays is not None and self.batch_option is not None:
             options += [self.batch_option, str(rays)]
         words = train_words(self.registered, options, scene, folder, steps, seed, device)
-        if self.whole_images or POSES_ALONE[0] in options:
+        if self.whole_images or POSES_ALONE[0] in self.options:
             words += ["--load-3D-points", str(self.whole_images)]
         return words
 

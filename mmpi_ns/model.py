@@ -93,6 +93,8 @@ class MMPIModelConfig(ModelConfig):
     total_steps: int = field(default=1, init=False)
     """Not an option: the trainer sets it from --max-num-iterations; the phases are shares of it. 0: as many as the
     capture needs by the defaults of ``method``."""
+    rays_times: int = field(default=1, init=False)
+    """Not an option: the trainer sets it; how many times the method's rays a step draws on this GPU."""
     method: str = field(default="", init=False)
     """Not an option: the trainer sets it to the name of the method."""
     windows_folder: Path | None = field(default=None, init=False)
@@ -165,7 +167,7 @@ class MMPIModel(Model):
         config, metadata = self.config, self.kwargs.get("metadata", {})
         observations = metadata.get(OBSERVATIONS)
         if observations is not None and config.total_steps == 0:
-            config.total_steps = steps_for(config.method, most_pixels(observations, placement))
+            config.total_steps = steps_for(config.method, most_pixels(observations, placement), config.rays_times)
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             return WindowedPlan.load(config.plan_file)
         if observations is None:

@@ -89,6 +89,9 @@ bool is_second(const at::Tensor& x) { return x.defined() && x.device().type() ==
 // The same memory as a tensor of the CPU: of views too.
 at::Tensor on_cpu(const at::Tensor& x) {
   if (!is_second(x)) return x;
+  int64_t last = x.numel() ? x.storage_offset() + 1 : 0;
+  for (int64_t d = 0; x.numel() && d < x.dim(); ++d) last += (x.size(d) - 1) * x.stride(d);
+  TORCH_CHECK(last * static_cast<int64_t>(x.element_size()) <= static_cast<int64_t>(x.storage().nbytes()), "a tensor reaches beyond its memory");
   auto* holder = new c10::Storage(x.storage());
   c10::DataPtr data(holder->mutable_data(), holder, [](void* h) { delete static_cast<c10::Storage*>(h); }, at::kCPU);
   c10::Storage storage(c10::Storage::use_byte_size_t(), holder->nbytes(), std::move(data), c10::GetCPUAllocator(), true);

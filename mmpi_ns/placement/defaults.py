@@ -35,7 +35,8 @@ RAYS_PER_PROCESSOR = 256
 """Pixel rays of a step for each multiprocessor of a GPU. By its registers the march has eight programs of 16 rays there
 at a time, so these and the rays of new views are some three rounds of them."""
 MOST_RAYS_TIMES = 4
-"""Largest multiple of a method's rays. Steps stay as they are: one takes as long for all of these (docs/gpu.md)."""
+"""Largest multiple of a method's rays: steps become as many times fewer. As many rays in a quarter of the steps give
+images as good, in an eighth worse ones (docs/log/performance.md)."""
 POSITIVE, NOT_NEGATIVE = Number(0, above=True), Number(0)
 RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),
@@ -50,17 +51,17 @@ FACES = ("front", "left", "right", "below")
 
 
 def rays_times(method: str, processors: int) -> int:
-    """How many times its rays a method with defaults draws in a step, a power of two. ``processors`` are the
-    multiprocessors of the GPU, 0 on a CPU."""
+    """How many times its rays a method with defaults draws in a step, in as many times fewer steps; a power of two.
+    ``processors`` are the multiprocessors of the GPU, 0 on a CPU."""
     fit = RAYS_PER_PROCESSOR * processors // DEFAULTS[method].rays
     return min(1 << max(fit, 1).bit_length() - 1, MOST_RAYS_TIMES)
 
 
-def steps_for(method: str, pixels: float) -> int:
+def steps_for(method: str, pixels: float, times: int = 1) -> int:
     """Training steps of a window, in hundreds: fewer for few training pixels, more for many (``FEW``, ``MANY``), in
-    proportion."""
+    proportion; fewer, too, if a step draws several times the method's rays (``rays_times``)."""
     default, multiple = DEFAULTS[method], min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES)
-    return 100 * round(max(default.least_steps, default.steps * multiple) / 100)
+    return 100 * round(max(default.least_steps, default.steps * multiple) / 100) // times
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:

@@ -143,7 +143,6 @@ class MMPITrainer(Trainer):
             model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
             self._suit_device(model_config, config.pipeline.datamanager)
             self._share: WindowShare | None = None
-            self._rays_times = 1
             if self.world_size > 1:
                 folders = [self.checkpoint_dir, *([config.load_dir] if config.load_dir else [])]
                 self._share = WindowShare(comms.get_rank(), self.world_size, folders)
@@ -169,14 +168,14 @@ class MMPITrainer(Trainer):
                 )
 
     def _suit_device(self, model_config: Any, manager: Any) -> None:
-        """Draws more rays a step on a large GPU where neither rays nor steps were asked for."""
+        """Draws more rays a step on a large GPU, in as many fewer steps, where neither was asked for."""
         asked = any(word.startswith("--pipeline.datamanager.train-num-rays-per-batch") for word in arguments())
         if asked or not self._follows_capture or not str(self.device).startswith("cuda"):
             return
         method, rays = model_config.method, manager.train_num_rays_per_batch
         if rays == DEFAULTS[method].rays:
             processors = torch.cuda.get_device_properties(self.device).multi_processor_count
-            self._rays_times = times = rays_times(method, processors)
+            model_config.rays_times = times = rays_times(method, processors)
             manager.train_num_rays_per_batch, manager.keypoint_rays = times * rays, times * manager.keypoint_rays
 
     def _announce(self, plan: WindowedPlan) -> None:
@@ -188,11 +187,11 @@ class MMPITrainer(Trainer):
         say(manager.describe())
         say(describe(plan, self._window_steps, tables, [manager.pixel_bytes(c) for c in cameras]))
         if self._follows_capture:
-            rays, times = manager.config.train_num_rays_per_batch, self._rays_times
+            rays, times = self._manager.config.train_num_rays_per_batch, self.config.pipeline.model.rays_times  # type: ignore[attr-defined]
             say(
                 f"{self._window_steps:,} steps{' a window' if len(plan) > 1 else ''} for its training pixels; "
                 "--max-num-iterations gives others."
-                + (f" {rays:,} rays a step, {times} times the method's, take this GPU no longer." if times > 1 else "")
+                + (f" {rays:,} rays a step, {times} times the method's, suit this GPU." if times > 1 else "")
             )
         if not str(self.device).startswith("cuda"):
             rays = self._manager.get_train_rays_per_batch()

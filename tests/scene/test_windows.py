@@ -18,6 +18,7 @@ from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import FEWEST, find_balls, most_pixels, of_cameras, place_windows
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
+from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 
 # Splitting -----------------------------------------------------------------------------------------------------------
 
@@ -42,9 +43,13 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     ("processors", "rays"),
     [(0, 4096), (28, 4096), (40, 8192), (82, 16384), (108, 16384), (132, 16384), (1000, 16384)],  # CPU, 3060, T4 ...
 )
-def test_a_larger_gpu_draws_more_rays_a_step(processors, rays):
+def test_a_larger_gpu_draws_more_rays_a_step_and_as_many_in_all(processors, rays):
     times = rays_times("mmpi", processors)
     assert times * DEFAULTS["mmpi"].rays == rays and rays_times("mmpi-small", processors) in (1, 4)
+    for pixels in (1.0, 2.5 * MANY):
+        assert times * steps_for("mmpi", pixels, times) == steps_for("mmpi", pixels)
+    whole, fewer = (make_schedule(ScheduleConfig(), 2000 // n) for n in (1, times))
+    assert [abs(times * a - b) < times for a, b in zip(fewer.growth, whole.growth, strict=True)] == [True] * 4
 
 
 def test_windows_hold_every_camera_are_no_longer_than_asked_and_grow_with_the_road():

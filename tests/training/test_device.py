@@ -63,6 +63,7 @@ def test_a_large_gpu_draws_more_rays_a_step_unless_rays_or_steps_were_asked_for(
             config.setup(local_rank=0, world_size=1).setup()
         manager = config.pipeline.datamanager
         assert (manager.train_num_rays_per_batch, manager.keypoint_rays) == (rays, keypoints)
+        assert config.pipeline.model.rays_times == rays // 1024
 
 
 def test_a_cpu_run_asks_for_no_gpu(monkeypatch, tmp_path):

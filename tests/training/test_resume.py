@@ -294,25 +294,25 @@ def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning
 def test_a_run_of_a_device_that_draws_more_rays_is_resumed_with_its_rays_and_steps(
     scene, plan_file, tmp_path, monkeypatch
 ):
-    """A GPU that draws four times the rays is faked; the run goes on on a CPU."""
+    """A GPU that draws four times the rays in a quarter of the steps is faked; the run goes on on a CPU."""
     monkeypatch.setitem(DEFAULTS, "mmpi-small", replace(DEFAULTS["mmpi-small"], steps=100, least_steps=100))
     config = trainer_config(scene, plan_file, tmp_path / "gpu", steps=0)
     manager = config.pipeline.datamanager
     few = manager.train_num_rays_per_batch, manager.keypoint_rays
     many = 4 * few[0], 4 * few[1]
-    manager.train_num_rays_per_batch, manager.keypoint_rays = many
+    manager.train_num_rays_per_batch, manager.keypoint_rays, config.pipeline.model.rays_times = *many, 4
     begun = ready(config)
     begun.save_checkpoint(3)
     with pytest.raises(InputError) as error:
         ready(trainer_config(scene, plan_file, tmp_path / "cpu", steps=0), load_dir=begun.checkpoint_dir)
-    options = "--max-num-iterations 100 --pipeline.datamanager.train-num-rays-per-batch {} --pipeline.datamanager."
-    assert "run of 100 steps of 256 rays, and 64 a step suit this device" in str(error.value)
+    options = "--max-num-iterations 25 --pipeline.datamanager.train-num-rays-per-batch {} --pipeline.datamanager."
+    assert "run of 25 steps of 256 rays, and 64 a step suit this device" in str(error.value)
     assert options.format(many[0]) + f"keypoint-rays {many[1]}." in str(error.value)
-    config = trainer_config(scene, plan_file, tmp_path / "cpu", steps=100)
+    config = trainer_config(scene, plan_file, tmp_path / "cpu", steps=25)
     manager = config.pipeline.datamanager
     manager.train_num_rays_per_batch, manager.keypoint_rays = many
     resumed = ready(config, load_dir=begun.checkpoint_dir)
-    assert resumed.pipeline.model.progress.schedule.total_steps == 100 and resumed._start_step == 4
+    assert resumed.pipeline.model.progress.schedule.total_steps == 25 and resumed._start_step == 4
 
 
 @pytest.mark.parametrize("steps", [0, 150])
