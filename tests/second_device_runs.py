@@ -1,4 +1,4 @@
-"""Trainings on a device that is not the CPU: run by training/test_second_device.py in a process of its own."""
+"""Trainings on a device that is not the CPU, by hand (docs/gpu.md): in a process of their own."""
 
 from __future__ import annotations
 

@@ -142,19 +142,20 @@ def test_a_process_that_outlasts_its_time_is_ended(tmp_path, monkeypatch):
 def test_a_session_writes_what_each_part_said_also_where_one_is_cut_off(tmp_path, monkeypatch, capsys):
     words = [[sys.executable, "-c", "print('well')"], ["no-such-command"]]
     words += [[sys.executable, "-c", "import time; print('begun', flush=True); time.sleep(90)"], words[0]]
+    words += [[sys.executable, "-c", "print('not run: it failed with status 1')"]]
     made = [
         gpu_session.Part(name, w, 60 if name != "slow" else 5)
-        for name, w in zip("a missing slow b".split(), words, strict=True)
+        for name, w in zip("a missing slow b unrun".split(), words, strict=True)
     ]
     monkeypatch.setattr(gpu_session, "parts", lambda *_: made)
     monkeypatch.setattr(sys, "argv", ["gpu_session.py", "--data", str(tmp_path), "--out", str(tmp_path / "out")])
     assert gpu_session.main() == 1
     found = json.loads((tmp_path / "out" / "session.json").read_text())["parts"]
     assert [(p["status"], p.get("ran_out_of_time", False)) for p in found.values()] == [
-        (0, False), (None, False), (-9, True), (0, False),
+        (0, False), (None, False), (-9, True), (0, False), (1, False),
     ]  # fmt: skip
     assert found["slow"]["output"] == "begun\n" and "FileNotFoundError" in found["missing"]["output"]
-    assert capsys.readouterr().out.count("status") == 4
+    assert capsys.readouterr().out.count("status") == 5
 
 
 def test_a_session_trains_at_full_size_and_ends_within_ten_minutes(tmp_path):

@@ -35,6 +35,17 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
 
 
+def test_variation_of_no_texels_is_zero():
+    layout = layout_of([(3, 7, 6)])
+    table, rows, scales = (
+        normal(len(layout.grids[0].places) * BRICK, 8),
+        torch.zeros(0, dtype=torch.int64),
+        torch.ones(1, 3),
+    )
+    for function in (total_variation, total_variation.reference):
+        assert function(table[rows], table, rows, layout, scales) == 0
+
+
 @pytest.mark.parametrize("channels", [1, 8, 9])
 def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(channels):
     layout = layout_of([(3, 70, 60), (2, 50, 41)])
