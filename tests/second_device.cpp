@@ -149,9 +149,11 @@ void fallback(const c10::OperatorHandle& op, Stack* stack) {
     if (x.device().type() == SECOND) any_second = true;
     else if (x.dim() > 0) cpu_one = name;
   };
-  auto cpu_tensor = [](const at::Tensor& x) { return x.defined() ? on_cpu(x) : x; };
+  // Kept until the results are read: torch hands back references to several results after it has dropped the arguments.
+  std::vector<at::Tensor> passed;
+  auto cpu_tensor = [&](const at::Tensor& x) { return x.defined() ? passed.emplace_back(on_cpu(x)) : x; };
   std::vector<at::Tensor> originals(count);
-    bool factory = false;
+  bool factory = false;
   for (size_t i = 0; i < count; ++i) {
     auto& value = (*stack)[start + i];
     const auto& name = schema.arguments()[i].name();

@@ -1,4 +1,4 @@
-"""Trainings on a device that is not the CPU, by hand (docs/gpu.md): in a process of their own."""
+"""Trainings on a device that is not the CPU, in a process of their own (``training/test_second_device.py``)."""
 
 from __future__ import annotations
 
