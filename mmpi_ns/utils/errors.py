@@ -29,6 +29,11 @@ def quoted(path: Path) -> str:
     return shlex.quote(str(path))
 
 
+def looked_at(path: Path) -> str:
+    """A path that is not there, for a sentence: with the folder from which a relative one is seen."""
+    return str(path) if path.is_absolute() else f"{path} in {Path.cwd()}, from where the path is seen"
+
+
 def say(text: str, style: str = "") -> None:
     """Prints text as it is: names may hold brackets, and no line is broken, so that commands can be copied."""
     CONSOLE.print(text, style=style, soft_wrap=True, highlight=False, markup=False)

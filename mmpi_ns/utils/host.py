@@ -15,6 +15,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from itertools import takewhile
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import ModuleType, TracebackType
@@ -128,6 +129,13 @@ def command() -> str | None:
 def arguments() -> list[str]:
     """The words after the command's name, with hyphens for underscores; none in a program that is no command."""
     return [word.replace("_", "-") for word in sys.argv[1:]] if command() else []
+
+
+def values_of(option: str) -> list[str]:
+    """The words that follow an option of the command, up to the next one; none where it is not given."""
+    words = [part for word in arguments() for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    behind = words[words.index(option) + 1 :] if option in words else []
+    return list(takewhile(lambda word: not word.startswith("--"), behind))
 
 
 def enter_command(training: bool = False) -> None:
