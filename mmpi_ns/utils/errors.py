@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +11,9 @@ from pathlib import Path
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a full disk, or of a user's share of it."""
+
 
 class InputError(ValueError):
     """Unusable input. The message is one sentence: what is wrong, where, and what to do."""
@@ -17,6 +21,14 @@ class InputError(ValueError):
 
 class WriteError(InputError, OSError):
     """Failure to write a file or folder; one sentence as well."""
+
+
+def disk_is_full(error: BaseException) -> str | None:
+    """A sentence for an error of writing to a full disk; None for any other error, and where there is a sentence."""
+    if not isinstance(error, OSError) or isinstance(error, InputError) or error.errno not in FULL:
+        return None
+    what = f"{error.filename} could not be written" if error.filename else "A file could not be written"
+    return f"{what} ({error.strerror}): finished files are untouched, so make room and start again."
 
 
 def brief(error: BaseException) -> str:

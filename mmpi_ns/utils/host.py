@@ -14,7 +14,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
 from threading import current_thread, main_thread
@@ -23,7 +23,7 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, disk_is_full
 
 TRACEBACK = "MMPI_TRACEBACK"
 """Set to 1 in the environment it shows the traceback of every error, and nerfstudio's notices."""
@@ -57,15 +57,17 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def _show_errors() -> Iterator[None]:
-    """sys.excepthook: an InputError ends a command with its sentence alone, and Ctrl-C with a word."""
+    """sys.excepthook: an InputError or a full disk ends a command with a sentence alone, and Ctrl-C with a word."""
     before = sys.excepthook
 
     def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if os.environ.get(TRACEBACK) == "1" or not issubclass(kind, (InputError, KeyboardInterrupt)):
+        full = disk_is_full(error)  # nerfstudio and torch write files too
+        if os.environ.get(TRACEBACK) == "1" or not (full or issubclass(kind, (InputError, KeyboardInterrupt))):
             before(kind, error, traceback)
             return
-        sys.stdout.flush()
-        said = error if issubclass(kind, InputError) else "Interrupted."
+        with suppress(OSError):  # which may be that full disk
+            sys.stdout.flush()
+        said = full or (error if issubclass(kind, InputError) else "Interrupted.")
         print(f"{Path(sys.argv[0]).stem}: {said}", file=sys.stderr, flush=True)
 
     sys.excepthook = show
