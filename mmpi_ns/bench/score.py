@@ -14,6 +14,7 @@ from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.pipeline import summary
+from mmpi_ns.utils.errors import looked_at
 from mmpi_ns.utils.values import Number, check_options
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -54,7 +55,7 @@ class Score:
         counts = {name: Number(0, whole=True) for name in ("downscale_factor", "test_images")}
         check_options(self, counts, "--")
         if not self.data.exists():
-            raise ValueError(f"There is no scene at {self.data}: check the path.")
+            raise ValueError(f"There is no scene at {looked_at(self.data)}: check the path.")
         parser = NerfstudioDataParserConfig(data=self.data, downscale_factor=self.downscale_factor)
         check_transforms(parser, self.data, ("test",), opens=True)
         truths = MMPIDataset(parser.setup().get_dataparser_outputs(split="test"))

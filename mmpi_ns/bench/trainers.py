@@ -9,19 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import torch
 
 P = "--pipeline.model.placement."
 JOINT = ("--pipeline.model.schedule.training", "joint")
 NO_TRACKS = ("--pipeline.datamanager.sfm-path", "none", "--pipeline.datamanager.triangulate", "False")
 """Options of our methods that leave pycolmap out: points are looked for by a plane sweep."""
-NO_MASKS = ("--pipeline.datamanager.mask-moving", "False")
-BARE = (
-    *(() if importlib.util.find_spec("pycolmap") else NO_TRACKS),
-    *(() if hasattr(cv2, "HOGDescriptor") else NO_MASKS),
-)
-"""Options of our methods on a machine without pycolmap, or with OpenCV 5, which finds no people."""
+BARE = () if importlib.util.find_spec("pycolmap") else NO_TRACKS
+"""Options of our methods on a machine without pycolmap."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.errors import InputError, brief, looked_at
+from mmpi_ns.utils.host import command
 from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
@@ -43,6 +44,9 @@ PARSER_OPTIONS = {
 }
 """Options that nerfstudio's data parsers have."""
 ORIENTATIONS = ("pca", "up", "vertical", "none")
+
+LOAD_RUNS = ("ns-eval", "ns-render", "ns-viewer", "ns-export", "mmpi-export")
+"""Commands that learn from a run's config.yml where the capture is."""
 
 Frames = Sequence[Mapping[str, Any]]
 POSITIVE = Number(0, above=True)
@@ -120,10 +124,19 @@ def say_once(text: str) -> None:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    if not path.is_file():
-        seen_from = "" if path.is_absolute() else f" in {Path.cwd()}, from where the path is seen"
+    if not path.is_file() and command() in LOAD_RUNS:
+        how = "in the run's config.yml (data, under pipeline.datamanager)"
+        if path.is_absolute():
+            raise InputError(
+                f"There is no {path}, the capture that this run was trained on: put it back, or correct its path {how}."
+            )
         raise InputError(
-            f"There is no {path}{seen_from}: check --data, make one with mmpi-prepare, or name the data parser of "
+            f"There is no {path} in {Path.cwd()}, and --data of this run is relative to the folder in which ns-train "
+            f"was started: start the command there, or give the whole path {how}."
+        )
+    if not path.is_file():
+        raise InputError(
+            f"There is no {looked_at(path)}: check --data, make one with mmpi-prepare, or name the data parser of "
             "another format after the options (for example: ns-train mmpi-small --data FOLDER colmap)."
         )
     try:

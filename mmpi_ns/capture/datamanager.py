@@ -35,7 +35,7 @@ from mmpi_ns.capture.rays import CameraRays
 from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import InputError, looked_at, say
 from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import generator
 from mmpi_ns.utils.values import check_options
@@ -91,6 +91,9 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     seed: int = field(default=0, init=False)
     """Not an option: the trainer sets it from --machine.seed. Batches depend on it and the step alone, so a resumed run
     draws what an uninterrupted one would."""
+    backdrop: float | None = field(default=None, init=False)
+    """Not an option: ns-render sets it to the gray level of the background of its images, over which it then shows the
+    originals too. nerfstudio takes four channels for features and shows their principal components."""
 
 
 class MMPIDataManager(VanillaDataManager[MMPIDataset]):
@@ -119,6 +122,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             check_transforms(parser, Path(config.data or parser.data), splits, opens=mode != "inference")
         take_local_origins(parser)
         super().__init__(config, **kwargs)
+        self.train_dataset.backdrop = self.eval_dataset.backdrop = config.backdrop
 
     def create_train_dataset(self) -> MMPIDataset:
         # First, so that what is wrong with the test images is said before minutes of matching.
@@ -328,7 +332,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 def check_there(data: Path) -> None:
     """Raises InputError where there is neither a folder nor a file."""
     if not data.exists():
-        raise InputError(f"There is no scene at {data}: check the path.")
+        raise InputError(f"There is no scene at {looked_at(data)}: check the path.")
 
 
 def load_observations(

@@ -60,6 +60,8 @@ class MMPIDataset(InputDataset):
 
     moving: Sequence[NDArray[np.bool_]] | None = None
     """Masks of what moves in each image [H, W], used in images that have no mask file."""
+    backdrop: float | None = None
+    """Gray level that see-through pixels are put over; None leaves images their alpha."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         if not dataparser_outputs.cameras.shape:  # nerfstudio's parser for Instant NGP: [4, 3] of a 4 x 4 matrix
@@ -93,6 +95,14 @@ class MMPIDataset(InputDataset):
             return pixels
         size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
         return np.array(Image.fromarray(pixels).resize(size, resample=Image.Resampling.BILINEAR))
+
+    def get_image_float32(self, image_idx: int) -> Tensor:
+        """Image [H, W, 3 or 4] in [0, 1]; over the backdrop if there is one."""
+        image = super().get_image_float32(image_idx)
+        if self.backdrop is None or image.shape[-1] == 3:
+            return image
+        colors, alpha = image.split([3, 1], -1)
+        return alpha * colors + (1 - alpha) * self.backdrop
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where any image has one."""

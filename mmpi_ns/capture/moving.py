@@ -28,7 +28,7 @@ from mmpi_ns.capture.moving_follow import upright_objects
 from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
 from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
-from mmpi_ns.capture.people import horizon_of, people_in, upright
+from mmpi_ns.capture.people import has_detector, horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import Parallax, View, look_up, straightened, straightened_color
 from mmpi_ns.placement.observations import Observations
@@ -142,7 +142,8 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
         }
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points), find)
+    lacks = () if has_detector() else ("people",)
+    stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points, *lacks), find)
 
     def unpacked(i: int) -> Mask:
         height, width = shapes[i]

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View, load_view
 
@@ -33,6 +34,17 @@ SLOPE = 0.3
 """Sine of the pitch up to which cameras may all be tilted on a level path."""
 MARGIN = np.array([1 / 8, 1 / 8])
 """Around the person in the detector's window, at each side, as a share of its width and height."""
+
+
+def has_detector() -> bool:
+    """Whether OpenCV has its detector of people, which left it with version 5; if not, says so once."""
+    if hasattr(cv2, "HOGDescriptor"):
+        return True
+    say_once(
+        f"People are not looked for, only what moves otherwise: OpenCV {cv2.__version__} has no detector (pip install "
+        "'opencv-python-headless<5' brings it back)."
+    )
+    return False
 
 
 def upright(camera_to_worlds: Float[ndarray, "M 3 4"]) -> Float[ndarray, "3"]:
@@ -65,7 +77,7 @@ def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) 
         up: unit vector in the world.
     """
     nobody, horizon = np.zeros((0, 4), int), horizon_of(view, up)
-    if horizon is None:
+    if horizon is None or not has_detector():
         return nobody
     wide = load_view(images, i, SIDE)
     height, width = wide.gray.shape

@@ -38,7 +38,10 @@ class CannotCompile(Exception):
 
 def compiler() -> list[str]:
     """The compiler and its arguments. Raises CannotCompile if there is none."""
-    asked = shlex.split(os.environ.get("CXX", ""))  # a program and its arguments, ccache g++ for example
+    try:
+        asked = shlex.split(os.environ.get("CXX", ""))  # a program and its arguments, ccache g++ for example
+    except ValueError as error:
+        raise CannotCompile(f"CXX is {os.environ['CXX']}, which is no command ({error})") from error
     program = asked or [path for name in ("g++", "clang++") if (path := shutil.which(name))][:1]
     if not program:
         raise CannotCompile("no C++ compiler (g++ or clang++) is installed")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import shutil
@@ -29,13 +28,12 @@ from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.poses import make_cameras, parse_camera, read_poses
 from mmpi_ns.prepare.settings import Settings, check_settings, read_lists
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
-from mmpi_ns.utils.errors import InputError, progress, quoted, say
+from mmpi_ns.utils.errors import FULL, InputError, looked_at, progress, quoted, say
 from mmpi_ns.utils.files import whole, write_text
 
 WORK = ".prepare"
 WORDS = {"input": "reading", "masks": "reading", "features": "features", "matches": "matching", "model": "mapping"}
 """The stages in words, for the times in the report."""
-FULL = (errno.ENOSPC, errno.EDQUOT)
 LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 LEAST_IMAGES = 3
@@ -350,7 +348,7 @@ def prepare(settings: Settings) -> Verdict:
     check_settings(settings)
     source, scene = settings.input.resolve(), settings.scene.resolve()
     if not source.exists():
-        raise InputError(f"{settings.input} does not exist.")
+        raise InputError(f"There is no {looked_at(settings.input)}: check the path.")
     if settings.scene.is_file():
         raise InputError(f"{settings.scene} is a file: name a folder for the scene.")
     taken = export.existing_parts(scene)

@@ -81,7 +81,8 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     """The rays with nears and fars: ``ray_near`` of the plan and infinity, unless a crop has set tighter ones."""
     near = torch.full_like(bundle.origins[:, :1], plan.ray_near)
     bundle.nears = near if bundle.nears is None else torch.maximum(bundle.nears, near)
-    bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars
+    # ns-render --render-nearest-camera gives whole numbers.
+    bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars.to(near)
     return bundle
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import tyro
 
+from mmpi_ns.utils.errors import disk_is_full
+
 
 def say_version(name: str) -> None:
     """Prints the name and the version of pyproject.toml and ends the command if ``--version`` is its first argument."""
@@ -28,6 +30,6 @@ def run(name: str, command: Any, **how: Any) -> int:
     try:
         tyro.cli(command, **{"prog": name, **how}).main()
     except (ValueError, OSError) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(f"{name}: {disk_is_full(error) or error}", file=sys.stderr)
         return 1
     return 0

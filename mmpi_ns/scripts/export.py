@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mmpi_ns.scripts.command import run
-from mmpi_ns.utils.errors import quoted
+from mmpi_ns.utils.errors import looked_at, quoted
 from mmpi_ns.utils.files import write_errors
 from mmpi_ns.utils.values import Number, check_options
 
@@ -39,7 +39,8 @@ class _Run:
         """
         check_options(self, {"least": Number(0, 1), "compare": Number(0, whole=True)}, "--")
         if not self.load_config.is_file():
-            raise ValueError(f"There is no run at {self.load_config}: give the config.yml that ns-train wrote.")
+            where = looked_at(self.load_config)
+            raise ValueError(f"There is no run at {where}: give the config.yml that ns-train wrote.")
         folder = self.load_config.parent / "nerfstudio_models"
         if not any(folder.glob("step-*.ckpt")):
             raise ValueError(f"The run has no checkpoint in {folder}: train it at least until its first checkpoint.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -14,6 +15,7 @@ from mmpi_ns.placement.defaults import DEFAULTS, NOT_NEGATIVE, POSITIVE, check_p
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.host import arguments, values_of
 from mmpi_ns.utils.machine import unused_gpu
 from mmpi_ns.utils.values import Number, check_number, check_options, shown
 
@@ -118,6 +120,24 @@ def check_nothing_left(model: Any) -> None:
                     f"The run's config.yml asks for {option} {shown(getattr(group, name))}, which this version lacks: "
                     "use the version that trained the run, or train anew without it."
                 )
+
+
+def check_rendering() -> None:
+    """Raises InputError if ns-render would end in an error after it has loaded the run, or rendered."""
+    is_dataset = "dataset" in arguments()
+    if not is_dataset and shutil.which("ffmpeg") is None:
+        raise InputError(
+            "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install ffmpeg)."
+        )
+    names, holds = values_of("--rendered-output-names"), values_of("--image-format") == ["png"]
+    if is_dataset and "rgba" in names and not holds:
+        raise InputError("The output rgba is transparent, which JPEG is not: add --image-format png.")
+    holds = holds and names == ["rgba"] and values_of("--output-format") == ["images"]
+    if not is_dataset and "rgba" in names and not holds:
+        raise InputError(
+            "The output rgba is transparent, which videos, JPEG and the outputs beside it are not: ask for it alone, "
+            "with --output-format images --image-format png."
+        )
 
 
 def check_device(device_type: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import shutil
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.capture.new_views import image_and_mask
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, has_details, moved_cameras, write_details
+from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
@@ -36,7 +36,7 @@ from mmpi_ns.training.checkpoints import (
 )
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.options import check_device, check_nothing_left, check_run
+from mmpi_ns.training.options import check_device, check_nothing_left, check_rendering, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
@@ -67,11 +67,10 @@ class MMPITrainerConfig(TrainerConfig):
         They take every file in this folder for a checkpoint, so the last one is given explicitly.
         """
         enter_command()
-        if command() == "ns-render" and "dataset" not in arguments() and shutil.which("ffmpeg") is None:
-            raise InputError(  # nerfstudio checks only after loading
-                "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install "
-                "ffmpeg)."
-            )
+        if command() == "ns-render":
+            check_rendering()
+            manager: Any = self.pipeline.datamanager
+            manager.backdrop = BACKGROUNDS[cast(Any, self.pipeline.model).rendering.background]
         check_nothing_left(self.pipeline.model)
         folder = super().get_checkpoint_dir()
         steps = checkpoints_in(folder)

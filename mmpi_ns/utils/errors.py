@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,6 +10,9 @@ from pathlib import Path
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a full disk, or of a user's share of it."""
 
 
 class InputError(ValueError):
@@ -19,6 +23,14 @@ class WriteError(InputError, OSError):
     """Failure to write a file or folder; one sentence as well."""
 
 
+def disk_is_full(error: BaseException) -> str | None:
+    """A sentence for an error of writing to a full disk; None for any other error, and where there is a sentence."""
+    if not isinstance(error, OSError) or isinstance(error, InputError) or error.errno not in FULL:
+        return None
+    what = f"{error.filename} could not be written" if error.filename else "A file could not be written"
+    return f"{what} ({error.strerror}): finished files are untouched, so make room and start again."
+
+
 def brief(error: BaseException) -> str:
     """First sentence of an error, to quote in brackets in a sentence of ours."""
     return str(error).strip().split("\n")[0].split(". ")[0].rstrip(" .")
@@ -27,6 +39,11 @@ def brief(error: BaseException) -> str:
 def quoted(path: Path) -> str:
     """A path as a shell takes it, for a command to be copied."""
     return shlex.quote(str(path))
+
+
+def looked_at(path: Path) -> str:
+    """A path that is not there, for a sentence: with the folder from which a relative one is seen."""
+    return str(path) if path.is_absolute() else f"{path} in {Path.cwd()}, from where the path is seen"
 
 
 def say(text: str, style: str = "") -> None:

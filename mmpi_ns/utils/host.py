@@ -14,7 +14,8 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import ModuleType, TracebackType
@@ -22,7 +23,7 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, disk_is_full
 
 TRACEBACK = "MMPI_TRACEBACK"
 """Set to 1 in the environment it shows the traceback of every error, and nerfstudio's notices."""
@@ -56,15 +57,17 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def _show_errors() -> Iterator[None]:
-    """sys.excepthook: an InputError ends a command with its sentence alone, and Ctrl-C with a word."""
+    """sys.excepthook: an InputError or a full disk ends a command with a sentence alone, and Ctrl-C with a word."""
     before = sys.excepthook
 
     def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if os.environ.get(TRACEBACK) == "1" or not issubclass(kind, (InputError, KeyboardInterrupt)):
+        full = disk_is_full(error)  # nerfstudio and torch write files too
+        if os.environ.get(TRACEBACK) == "1" or not (full or issubclass(kind, (InputError, KeyboardInterrupt))):
             before(kind, error, traceback)
             return
-        sys.stdout.flush()
-        said = error if issubclass(kind, InputError) else "Interrupted."
+        with suppress(OSError):  # which may be that full disk
+            sys.stdout.flush()
+        said = full or (error if issubclass(kind, InputError) else "Interrupted.")
         print(f"{Path(sys.argv[0]).stem}: {said}", file=sys.stderr, flush=True)
 
     sys.excepthook = show
@@ -128,6 +131,13 @@ def command() -> str | None:
 def arguments() -> list[str]:
     """The words after the command's name, with hyphens for underscores; none in a program that is no command."""
     return [word.replace("_", "-") for word in sys.argv[1:]] if command() else []
+
+
+def values_of(option: str) -> list[str]:
+    """The words that follow an option of the command, up to the next one; none where it is not given."""
+    words = [part for word in arguments() for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    behind = words[words.index(option) + 1 :] if option in words else []
+    return list(takewhile(lambda word: not word.startswith("--"), behind))
 
 
 def enter_command(training: bool = False) -> None:

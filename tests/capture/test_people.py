@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving_evidence import Evidence, Shot
 from mmpi_ns.capture.moving_objects import grown
@@ -82,6 +83,13 @@ def test_what_does_not_stand_on_the_ground_is_none(tmp_path, feet):
 def test_nobody_is_searched_where_the_camera_looks_down_or_the_image_is_small(tmp_path):
     assert found(tmp_path, figure(COLUMN, FEET), 80.0).shape == (0, 4)
     assert found(tmp_path, np.full((HEIGHT, WIDTH), 90, np.uint8)).shape == (0, 4)
+
+
+def test_where_opencv_has_no_detector_nobody_is_searched_and_it_is_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.delattr(cv2, "HOGDescriptor")
+    say_once.cache_clear()
+    assert found(tmp_path, figure(COLUMN, FEET)).shape == (0, 4)
+    assert f"OpenCV {cv2.__version__} has no detector" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("is_static", [False, True])

@@ -99,6 +99,11 @@ def test_a_compiler_that_fails_is_named(monkeypatch, unbuilt, capsys):
     assert not list(unbuilt.glob("mmpi_ns/*.so"))
 
 
+def test_a_compiler_that_is_no_command_is_named(monkeypatch, unbuilt):
+    monkeypatch.setenv("CXX", "'g++")
+    assert "CXX is 'g++, which is no command" in str(dispatch.fault("C++"))
+
+
 def test_a_compiler_may_come_with_arguments(monkeypatch, unbuilt):
     given = unbuilt / "given"
     script = unbuilt / "my-compiler"

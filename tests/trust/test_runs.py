@@ -348,7 +348,19 @@ def test_evaluation_of_a_capture_that_has_gone_is_one_sentence(whole_scene, tmp_
     data = shutil.copytree(whole_scene, tmp_path / "gone")
     assert train(data, tmp_path).status == 0
     shutil.rmtree(data)
-    assert "There is no" in evaluate(folder_of(tmp_path), tmp_path).sentence
+    said = evaluate(folder_of(tmp_path), tmp_path).sentence
+    assert f"There is no {data / 'transforms.json'}, the capture that this run" in said and "config.yml" in said
+
+
+@pytest.mark.parametrize("command", ["ns-eval", "mmpi-export"])
+def test_a_capture_by_a_relative_path_of_another_folder_is_told(finished, tmp_path, command):
+    config = yaml.load((finished / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.data = Path("captures/tiny")  # as ns-train wrote it once
+    (finished / "config.yml").write_text(yaml.dump(config))
+    output = ["--output-path", tmp_path / "eval.json"] if command == "ns-eval" else ["--output", tmp_path / "out"]
+    words = (command, *(["bake"] if command == "mmpi-export" else []), "--load-config", finished / "config.yml")
+    said = run(*words, *output).sentence
+    assert said.startswith(f"There is no captures/tiny/transforms.json in {Path.cwd()}, and --data of this run")
 
 
 def test_a_run_shows_no_warning_that_users_can_do_nothing_about(whole_scene, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import errno
 import signal
 import subprocess
 import sys
@@ -165,8 +166,11 @@ def test_an_input_error_is_one_sentence_and_others_keep_their_traceback(monkeypa
     assert capsys.readouterr().err == "ns-train: The scene is empty.\n" and not shown
     sys.excepthook(KeyboardInterrupt, KeyboardInterrupt(), None)
     assert not shown and capsys.readouterr().err.endswith(": Interrupted.\n")
+    sys.excepthook(OSError, OSError(errno.ENOSPC, "No space left on device", "/out/config.yml"), None)
+    assert not shown and "/out/config.yml could not be written (No space left" in capsys.readouterr().err
     sys.excepthook(KeyError, KeyError("x"), None)
-    assert len(shown) == 1
+    sys.excepthook(OSError, OSError(errno.ENOENT, "No such file or directory"), None)
+    assert len(shown) == 2
 
 
 def test_scores_of_one_test_image_come_without_a_warning(monkeypatch, mallocs):
