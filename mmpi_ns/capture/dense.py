@@ -175,6 +175,7 @@ def find_depths(
     finish: Callable[[int, View, Depth], T] = lambda _, view, depth: (view, depth),
     progress: Progress = lambda work, _: work,
     rounds: Sequence[int] | None = None,
+    among: Sequence[int] | None = None,
 ) -> Iterator[T]:
     """The depths of all images in turn, by all threads; their number does not change the depths.
 
@@ -185,9 +186,10 @@ def find_depths(
         finish: makes an image's result from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
         rounds: of matching; None: by size.
+        among: the images that others are compared with; None for all.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        results = in_turn(_tasks(pool, images, points_of, width, finish, rounds), num_threads() + 1)
+        results = in_turn(_tasks(pool, images, points_of, width, finish, rounds, among), num_threads() + 1)
         for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()
@@ -202,6 +204,7 @@ def _tasks(
     width: int,
     finish: Callable[[int, View, Depth], T],
     rounds: Sequence[int] | None,
+    among: Sequence[int] | None,
 ) -> Iterator[tuple[bool, Future[Any]]]:
     """Matches and confirms images, in an order in which no thread waits for a later task; True: an image's last task.
 
@@ -217,7 +220,9 @@ def _tasks(
         return finish(i, view, confirmed(view, depth, others))
 
     # Each image, then its neighbours.
-    near = [[i, *nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE)] for i in range(len(images.files))]
+    near = [
+        [i, *nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, among)] for i in range(len(images.files))
+    ]
     last_uses = {j: i for i, views in enumerate(near) for j in views}
     shown: dict[int, Future[View]] = {}
     depths: dict[int, Future[Depth]] = {}

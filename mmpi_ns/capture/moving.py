@@ -2,7 +2,8 @@
 
 Every image is compared with its neighbours at reduced size (``moving_evidence.py``), also at depths that only something
 that moves can seem to have (``moving_sweep.py``); what is left over grows to objects (``moving_objects.py``). A second
-pass looks again near images in which something moves, without what moves in them.
+pass looks again near images in which something moves, without what moves in them. Of a video, key images are compared
+with each other, and the images between them only where something moves near them.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -30,7 +31,7 @@ from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import has_detector, horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
-from mmpi_ns.capture.views import Parallax, View, look_up, straightened, straightened_color
+from mmpi_ns.capture.views import Parallax, View, look_up, project, straightened, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import duration
@@ -52,7 +53,11 @@ SECONDS = 0.5
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is."""
-VERSION = 10
+COMPARED, FIRST, FEW = 0.02, 0.06, 30
+"""Median distance between points in a key image and in the next one, in widths, at most: of those that others are
+compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
+first. Fewer points tell nothing."""
+VERSION = 11
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -80,28 +85,59 @@ def find_moving(
     def shot_of(i: int, view: View, depth: Depth) -> Shot:
         color = cv2.GaussianBlur(straightened_color(images, i, view), (0, 0), 1.0)
         ground = ground_of(view, depth, up)
-        horizon = None if ground is None else horizon_of(view, up)
-        return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon, people_in(images, i, view, up))
+        return Shot(view, np.asarray(color, np.uint8), depth, ground, None if ground is None else horizon_of(view, up))
 
-    shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS))
+    keys = key_images(images, points_of, COMPARED)
+    shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS, keys))
     near = []
     for i in range(len(shots)):
-        nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE)
+        nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE, keys)
         near.append([nearest[rank] for rank in RANKS if rank < len(nearest)])
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
+    nothing, first = masks.copy(), {}
+
+    def look(i: int) -> tuple[Mask, _First]:
+        shots[i] = replace(shots[i], people=people_in(images, i, shots[i].view, up))
+        return _moves(shots, near[i], i, nothing, nothing[i], None)
+
+    def moves_near(i: int) -> bool:
+        return any(masks[j].any() for j in near[i])
+
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        first = list(pool.map(lambda i: _moves(shots, near[i], i, masks, masks[i], None), range(len(shots))))
-        masks = [mask for mask, _ in first]
+        part = key_images(images, points_of, FIRST)
+        while part:
+            for i, (mask, knowledge) in zip(part, pool.map(look, part), strict=True):
+                masks[i], first[i] = mask, knowledge
+            part = [i for i in range(len(shots)) if i not in first and moves_near(i)]
         uprights = upright_objects(shots, near, masks, pool)
         masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
-        again = [i for i in range(len(shots)) if any(masks[j].any() for j in near[i])]
-        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i][1]), again))
+        again = [i for i in first if moves_near(i)]
+        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
     # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         masks = [np.zeros_like(mask) for mask in masks]
     return [shot.view for shot in shots], masks
+
+
+def key_images(images: PosedImages, points_of: Callable[[int], NDArray[np.float64]], spacing: float) -> list[int]:
+    """Images as far apart, in their order, as can be with points at most ``spacing`` (median, in widths) from where the
+    last one shows them: all, but for those of a video that follow closely."""
+
+    def shift(i: int, j: int) -> float:
+        points = points_of(i)
+        if len(points) < FEW:
+            return np.inf
+        moved = np.linalg.norm(project(images, j, points) - project(images, i, points), axis=-1)
+        return float(np.median(moved)) / float(images.sizes[i].max())
+
+    keys, last = [0], len(images.files) - 1
+    while keys[-1] < last:
+        first = keys[-1]
+        far = (j for j in range(first + 1, last + 1) if not shift(first, j) < spacing)
+        keys.append(max(first + 1, next(far, last + 1) - 1))
+    return keys
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:
