@@ -26,6 +26,8 @@ from mmpi_scene.movers import MOVER, with_movers
 
 STREETS = (*(("street", seed) for seed in range(5)), *(("walk", seed) for seed in range(3)))
 """Names and seeds of the procedural scenes with movers."""
+VIDEO = 120, 16.0
+"""Images and metres of a street whose frames follow closely, as in a video."""
 
 
 @dataclass(kw_only=True)
@@ -53,6 +55,8 @@ class MovingBench(Bench):
         for name, seed in STREETS:
             data = self._street(name, seed, self.movers)
             report.row(f"{name}, seed {seed}", lambda data=data: masked_shares(data, 1))
+        video = self._street("street", 0, self.movers, *VIDEO)
+        report.row("a video on street, seed 0", lambda: masked_shares(video, 1))
         for data in self.data:
             factor = next((f for f in (2, 4) if (data / f"images_{f}").is_dir()), 1)
             report.row(data.resolve().name, lambda data=data, factor=factor: masked_shares(data, factor))
@@ -62,11 +66,11 @@ class MovingBench(Bench):
                 report.row(title, lambda movers=movers, mask=mask: self._trained(movers, mask))
         report.finish({}, markdown(report.content))
 
-    def _street(self, name: str, seed: int, movers: int) -> Path:
-        """A procedural scene, written unless it is there."""
-        folder = self.folder / f"{name}-{seed}-{movers}"
+    def _street(self, name: str, seed: int, movers: int, count: int = 0, length: float | None = None) -> Path:
+        """A procedural scene, written unless it is there; of ``count`` images and its own length, if none are given."""
+        folder = self.folder / "-".join(map(str, (name, seed, movers, *((count, length) if count else ()))))
         if not (folder / "transforms.json").is_file():
-            scene = make_scene(name, seed, self.count, self.width, self.height)
+            scene = make_scene(name, seed, count or self.count, self.width, self.height, length)
             write_dataset(with_movers(scene, movers) if movers else scene, folder, processes=self.cores)
         return folder
 
