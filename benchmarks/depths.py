@@ -28,8 +28,9 @@ CAPTURES = {
     "walk, 12 images": ("walk", 12, 480, 270),
     "street, 48 images": ("street", 48, 620, 188),
     "street, 16 images": ("street", 16, 620, 188),
+    "street, a video: 120 images of 16 m": ("street", 120, 480, 270, 16.0),
 }
-"""Kind, number of images of the same way, and their size."""
+"""Kind, number of images of the same way, their size, and its length where it is not the usual one."""
 POINTS = 25
 """SfM points for each image."""
 
@@ -48,18 +49,18 @@ class DepthsBench(Bench):
 
     def run(self) -> None:
         report = Report(self, key=self.key("data"))
-        for name, (kind, count, width, height) in CAPTURES.items():
-            report.row(name, lambda scene=(kind, count, width, height): self._row(self._scene(*scene), 1))
+        for name, scene in CAPTURES.items():
+            report.row(name, lambda scene=scene: self._row(self._scene(*scene), 1))
         for data in self.data:
             factor = 2 if (data / "images_2").is_dir() else 1
             report.row(data.resolve().name, lambda data=data, factor=factor: self._row(data, factor))
         report.finish({}, markdown(report.content))
 
-    def _scene(self, kind: Any, count: int, width: int, height: int) -> Path:
+    def _scene(self, kind: Any, count: int, width: int, height: int, length: float | None = None) -> Path:
         """A procedural capture, written unless it is there."""
         folder = self.folder / f"{kind}-{count}"
         if not (folder / "transforms.json").is_file():
-            scene = make_scene(kind, 0, count, width, height)
+            scene = make_scene(kind, 0, count, width, height, length)
             write_dataset(scene, folder, POINTS * count, processes=self.cores)
         return folder
 
