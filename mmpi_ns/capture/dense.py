@@ -27,7 +27,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from mmpi_ns.capture.patches import Surfaces, search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, project, strips
+from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
 from mmpi_ns.ops.motion import find_motion
 from mmpi_ns.scene.near_views import nearest_views
@@ -60,9 +60,6 @@ WINDOW = 7
 """Side of the window in which images are compared, working pixels."""
 MIN_CORRELATION, MIN_CONTRAST = 0.5, 1.0
 """Least correlation of windows that match, and least standard deviation of their gray levels."""
-SPACING, FEW = 0.02, 30
-"""Median distance between SfM points in a key image and in the next one, in widths, at most; fewer tell nothing. What
-follows more closely has little parallax, and what moves slowly hides the same in it."""
 EDGE, STEP = 9, 1.1
 """An edge: inverse depths that differ by this factor in a window of this many pixels. Background there moves along."""
 OWN_CONTRAST = 4.0
@@ -171,27 +168,6 @@ def fuse(inverse: Sequence[Map], weight: Sequence[Map]) -> Depth:
     return depth
 
 
-def key_images(
-    images: PosedImages, points_of: Callable[[int], NDArray[np.float64]], spacing: float = SPACING
-) -> list[int]:
-    """Images as far apart, in their order, as can be with points at most ``spacing`` (median, in widths) from where the
-    last one shows them: all, but for those of a video that follow closely."""
-
-    def shift(i: int, j: int) -> float:
-        points = points_of(i)
-        if len(points) < FEW:
-            return np.inf
-        moved = np.linalg.norm(project(images, j, points) - project(images, i, points), axis=-1)
-        return float(np.median(moved)) / float(images.sizes[i].max())
-
-    keys, last = [0], len(images.files) - 1
-    while keys[-1] < last:
-        first = keys[-1]
-        far = (j for j in range(first + 1, last + 1) if not shift(first, j) < spacing)
-        keys.append(max(first + 1, next(far, last + 1) - 1))
-    return keys
-
-
 def find_depths(
     images: PosedImages,
     points_of: Callable[[int], NDArray[np.float64]],
@@ -199,6 +175,7 @@ def find_depths(
     finish: Callable[[int, View, Depth], T] = lambda _, view, depth: (view, depth),
     progress: Progress = lambda work, _: work,
     rounds: Sequence[int] | None = None,
+    among: Sequence[int] | None = None,
 ) -> Iterator[T]:
     """The depths of all images in turn, by all threads; their number does not change the depths.
 
@@ -209,9 +186,10 @@ def find_depths(
         finish: makes an image's result from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
         rounds: of matching; None: by size.
+        among: the images that others are compared with; None for all.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        results = in_turn(_tasks(pool, images, points_of, width, finish, rounds), num_threads() + 1)
+        results = in_turn(_tasks(pool, images, points_of, width, finish, rounds, among), num_threads() + 1)
         for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()
@@ -226,6 +204,7 @@ def _tasks(
     width: int,
     finish: Callable[[int, View, Depth], T],
     rounds: Sequence[int] | None,
+    among: Sequence[int] | None,
 ) -> Iterator[tuple[bool, Future[Any]]]:
     """Matches and confirms images, in an order in which no thread waits for a later task; True: an image's last task.
 
@@ -241,8 +220,9 @@ def _tasks(
         return finish(i, view, confirmed(view, depth, others))
 
     # Each image, then its neighbours.
-    poses, keys = images.camera_to_worlds, key_images(images, points_of)
-    near = [[i, *nearest_views(poses, i, NEIGHBOURS, MAX_ANGLE, keys)] for i in range(len(poses))]
+    near = [
+        [i, *nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, among)] for i in range(len(images.files))
+    ]
     last_uses = {j: i for i, views in enumerate(near) for j in views}
     shown: dict[int, Future[View]] = {}
     depths: dict[int, Future[Depth]] = {}

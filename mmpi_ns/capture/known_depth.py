@@ -37,7 +37,7 @@ from mmpi_ns.utils.parallel import in_order, num_threads
 
 Codes = NDArray[np.int16]
 
-VERSION = 16
+VERSION = 15
 """Version of the algorithm: cached depths of another version are recomputed."""
 FINER, WIDEST = 2.0, 1600
 """Images are matched at this multiple of the training size, and at most this wide, if the originals are available."""

@@ -22,7 +22,7 @@ from rich.progress import track
 
 from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.dense import Depth, Progress, find_depths, key_images
+from mmpi_ns.capture.dense import Depth, Progress, find_depths
 from mmpi_ns.capture.moving_carry import carried
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
 from mmpi_ns.capture.moving_follow import upright_objects
@@ -31,7 +31,7 @@ from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import has_detector, horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
-from mmpi_ns.capture.views import Parallax, View, look_up, straightened, straightened_color
+from mmpi_ns.capture.views import Parallax, View, look_up, project, straightened, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import duration
@@ -53,8 +53,10 @@ SECONDS = 0.5
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is."""
-FIRST = 0.06
-"""Spacing of the images that are looked at first (``key_images``)."""
+COMPARED, FIRST, FEW = 0.02, 0.06, 30
+"""Median distance between points in a key image and in the next one, in widths, at most: of those that others are
+compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
+first. Fewer points tell nothing."""
 VERSION = 11
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
@@ -85,8 +87,9 @@ def find_moving(
         ground = ground_of(view, depth, up)
         return Shot(view, np.asarray(color, np.uint8), depth, ground, None if ground is None else horizon_of(view, up))
 
-    shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS))
-    keys, near = key_images(images, points_of), []
+    keys = key_images(images, points_of, COMPARED)
+    shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS, keys))
+    near = []
     for i in range(len(shots)):
         nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE, keys)
         near.append([nearest[rank] for rank in RANKS if rank < len(nearest)])
@@ -116,6 +119,25 @@ def find_moving(
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         masks = [np.zeros_like(mask) for mask in masks]
     return [shot.view for shot in shots], masks
+
+
+def key_images(images: PosedImages, points_of: Callable[[int], NDArray[np.float64]], spacing: float) -> list[int]:
+    """Images as far apart, in their order, as can be with points at most ``spacing`` (median, in widths) from where the
+    last one shows them: all, but for those of a video that follow closely."""
+
+    def shift(i: int, j: int) -> float:
+        points = points_of(i)
+        if len(points) < FEW:
+            return np.inf
+        moved = np.linalg.norm(project(images, j, points) - project(images, i, points), axis=-1)
+        return float(np.median(moved)) / float(images.sizes[i].max())
+
+    keys, last = [0], len(images.files) - 1
+    while keys[-1] < last:
+        first = keys[-1]
+        far = (j for j in range(first + 1, last + 1) if not shift(first, j) < spacing)
+        keys.append(max(first + 1, next(far, last + 1) - 1))
+    return keys
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:

@@ -12,7 +12,7 @@ from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
 from mmpi_ns.capture import dense
-from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, key_images, without_fringes
+from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, without_fringes
 from mmpi_ns.capture.views import View, camera_matrix, load_view, look_up, project
 
 F32 = np.float32
@@ -99,22 +99,6 @@ def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens, fishey
     assert np.median(error) < 0.003 and np.quantile(error, 0.9) < 0.02 and (error > 0.1).mean() < 0.04
     assert np.quantile(scaled, 0.9) < 2  # these walls are easier than the errors allow for
     assert all((d.error[d.inverse > 0] > 0).all() and not d.error[d.inverse == 0].any() for _, d in found)
-
-
-def test_frames_that_follow_closely_are_compared_with_those_of_some_parallax(tmp_path, monkeypatch):
-    poses = [np.array(POSES[0]) for _ in range(13)]
-    for n, pose in enumerate(poses):
-        pose[0, 3] += 0.01 * n
-    images, covers = scene_of(tmp_path, poses), {}
-    for spacing, neighbours in ((dense.SPACING, [0, 6, 12]), (0.0, [*range(13)])):
-        keys = key_images(images, lambda i: points_on_walls(poses[i]), spacing)
-        assert keys == neighbours
-        monkeypatch.setattr(dense, "key_images", lambda *_, keys=keys: keys)
-        depths = list(find_depths(images, lambda i: points_on_walls(poses[i]), WIDTH))
-        covers[spacing] = np.mean([(d.inverse > 0).mean() for _, d in depths])
-        if spacing:
-            assert np.median(relative_errors(depths, poses)[0]) < 0.0015
-    assert covers[dense.SPACING] > 0.95 and covers[0.0] < 0.3
 
 
 def test_rough_points_are_no_more_than_a_start(tmp_path):

@@ -14,8 +14,8 @@ from training_runs import datamanager
 
 from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
-from mmpi_ns.capture.dense import Depth, key_images
-from mmpi_ns.capture.moving import find_moving, gain_of, in_image
+from mmpi_ns.capture.dense import Depth
+from mmpi_ns.capture.moving import find_moving, gain_of, in_image, key_images
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import (
     LEAST_LEVELS,
@@ -114,10 +114,11 @@ def test_key_images_are_as_far_apart_as_asked():
 def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatch, something_moves):
     """Of 25 frames every sixth comes first; what moves in one is looked for in others near it, on and on."""
     view = View(np.zeros((50, 100), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((50, 100), bool))
-    looked_at = []
+    looked_at, compared = [], []
     nothing = Depth(*np.zeros((2, 50, 100), np.float32))
 
-    def depths(images, points_of, width, finish, progress, rounds):
+    def depths(images, points_of, width, finish, progress, rounds, among):
+        compared.append(among)
         return iter([Shot(view, np.zeros((50, 100, 3), np.uint8), nothing, None) for _ in images.files])
 
     def moves(shots, near, i, masks, uprights, first):
@@ -130,6 +131,7 @@ def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatc
     monkeypatch.setattr(moving, "_moves", moves)
     monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
     _, masks = find_moving(aside(*np.arange(25) * 0.0099), lambda i: wall())
+    assert compared == [list(range(0, 25, 2))]
     assert sorted(looked_at[:5]) == [0, 6, 12, 18, 24]
     assert len(set(looked_at)) == len(looked_at)
     if something_moves:
