@@ -89,10 +89,7 @@ def find_moving(
 
     keys = key_images(images, points_of, COMPARED)
     shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS, keys))
-    near = []
-    for i in range(len(shots)):
-        nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE, keys)
-        near.append([nearest[rank] for rank in RANKS if rank < len(nearest)])
+    near = [neighbours(images, i, keys) for i in range(len(shots))]
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
     nothing, first = masks.copy(), {}
 
@@ -119,6 +116,12 @@ def find_moving(
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         masks = [np.zeros_like(mask) for mask in masks]
     return [shot.view for shot in shots], masks
+
+
+def neighbours(images: PosedImages, i: int, keys: Sequence[int]) -> list[int]:
+    """The key images that an image is compared with, nearest first."""
+    nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE, keys)
+    return [nearest[rank] for rank in RANKS if rank < len(nearest)]
 
 
 def key_images(images: PosedImages, points_of: Callable[[int], NDArray[np.float64]], spacing: float) -> list[int]:
