@@ -101,6 +101,19 @@ def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens, fishey
     assert all((d.error[d.inverse > 0] > 0).all() and not d.error[d.inverse == 0].any() for _, d in found)
 
 
+def test_images_are_compared_with_those_that_are_named(tmp_path):
+    """Thirteen frames a step of 1 cm apart: hardly any parallax to the nearest ones, and enough to every sixth."""
+    poses = [np.array(POSES[0]) for _ in range(13)]
+    for n, pose in enumerate(poses):
+        pose[0, 3] += 0.01 * n
+    images, covers = scene_of(tmp_path, poses), []
+    for among in (None, [0, 6, 12]):
+        depths = list(find_depths(images, lambda i: points_on_walls(poses[i]), WIDTH, among=among))
+        covers.append(np.mean([(d.inverse > 0).mean() for _, d in depths]))
+    assert covers[0] < 0.3 and covers[1] > 0.95
+    assert np.median(relative_errors(depths, poses)[0]) < 0.0015
+
+
 def test_rough_points_are_no_more_than_a_start(tmp_path):
     """Points a fifth too far: the depths found are those of the images."""
     images = scene_of(tmp_path, POSES)

@@ -112,9 +112,10 @@ def test_key_images_are_as_far_apart_as_asked():
 
 @pytest.mark.parametrize("something_moves", [False, True])
 def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatch, something_moves):
-    """Of 25 frames every sixth comes first; what moves in one is looked for in others near it, on and on."""
+    """Of 49 frames every sixth comes first; what moves in one is looked for in others near it, on and on."""
     view = View(np.zeros((50, 100), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((50, 100), bool))
     looked_at, compared = [], []
+    shows = {12} | {i for i in range(13, 48) if i % 6}  # which one alone that comes first shows
     nothing = Depth(*np.zeros((2, 50, 100), np.float32))
 
     def depths(images, points_of, width, finish, progress, rounds, among):
@@ -124,21 +125,20 @@ def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatc
     def moves(shots, near, i, masks, uprights, first):
         if first is None:
             looked_at.append(i)
-            assert not any(mask.any() for mask in masks) and set(near) <= set(range(0, 25, 2))
-        return np.full((50, 100), something_moves and 8 <= i <= 16), "knowledge"
+            assert not any(mask.any() for mask in masks) and set(near) <= set(range(0, 49, 2))
+        return np.full((50, 100), something_moves and i in shows), "knowledge"
 
     monkeypatch.setattr(moving, "find_depths", depths)
     monkeypatch.setattr(moving, "_moves", moves)
     monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
-    _, masks = find_moving(aside(*np.arange(25) * 0.0099), lambda i: wall())
-    assert compared == [list(range(0, 25, 2))]
-    assert sorted(looked_at[:5]) == [0, 6, 12, 18, 24]
+    _, masks = find_moving(aside(*np.arange(49) * 0.0099), lambda i: wall())
+    assert compared == [list(range(0, 49, 2))]
+    assert sorted(looked_at[:9]) == [*range(0, 49, 6)]
     assert len(set(looked_at)) == len(looked_at)
     if something_moves:
-        assert {*range(8, 17)} <= set(looked_at)
-        assert [i for i, mask in enumerate(masks) if mask.any()] == list(range(8, 17))
+        assert {i for i, mask in enumerate(masks) if mask.any()} == shows
     else:
-        assert len(looked_at) == 5
+        assert len(looked_at) == 9
 
 
 def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed_or_a_person(monkeypatch):
