@@ -129,11 +129,11 @@ def check_rendering() -> None:
         raise InputError(
             "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install ffmpeg)."
         )
-    names, holds = values_of("--rendered-output-names"), values_of("--image-format") == ["png"]
-    if is_dataset and "rgba" in names and not holds:
+    names, keeps_alpha = values_of("--rendered-output-names"), values_of("--image-format") == ["png"]
+    if is_dataset and "rgba" in names and not keeps_alpha:
         raise InputError("The output rgba is transparent, which JPEG is not: add --image-format png.")
-    holds = holds and names == ["rgba"] and values_of("--output-format") == ["images"]
-    if not is_dataset and "rgba" in names and not holds:
+    keeps_alpha = keeps_alpha and names == ["rgba"] and values_of("--output-format") == ["images"]
+    if not is_dataset and "rgba" in names and not keeps_alpha:
         raise InputError(
             "The output rgba is transparent, which videos, JPEG and the outputs beside it are not: ask for it alone, "
             "with --output-format images --image-format png."
