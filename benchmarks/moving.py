@@ -68,7 +68,7 @@ class MovingBench(Bench):
 
     def _street(self, name: str, seed: int, movers: int, count: int = 0, length: float | None = None) -> Path:
         """A procedural scene, written unless it is there; of ``count`` images and its own length, if none are given."""
-        folder = self.folder / "-".join(map(str, (name, seed, movers, *((count, length) if count else ()))))
+        folder = self.folder / (f"{name}-{seed}-{movers}" + (f"-{count}" if count else ""))
         if not (folder / "transforms.json").is_file():
             scene = make_scene(name, seed, count or self.count, self.width, self.height, length)
             write_dataset(with_movers(scene, movers) if movers else scene, folder, processes=self.cores)

@@ -15,7 +15,7 @@ from training_runs import datamanager
 from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving import find_moving, gain_of, in_image, key_images
+from mmpi_ns.capture.moving import find_moving, gain_of, in_image
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import (
     LEAST_LEVELS,
@@ -80,65 +80,6 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     images = PosedImages((Path("x"),) * 3, poses, np.ones((3, 4)), np.tile([50.0, 20], (3, 1)), np.zeros((3, 4)))
     _, masks = find_moving(images, lambda i: np.zeros((0, 3)))
     assert [int(mask.sum()) for mask in masks] == ([3, 16, 3] if large else [0, 0, 0])
-
-
-def aside(*places):
-    """Cameras before a wall, so far from the first as its points shift in the image, in widths."""
-    poses = np.tile(np.eye(4)[:3], (len(places), 1, 1))
-    poses[:, 0, 3] = places
-    pinhole, size = np.tile([100.0, 100, 50, 25], (len(places), 1)), np.tile([100.0, 50], (len(places), 1))
-    files = tuple(map(Path, map(str, range(len(places)))))
-    return PosedImages(files, poses, pinhole, size, np.zeros((len(places), 4)))
-
-
-def wall(count=40):
-    rng = np.random.default_rng(0)
-    return np.stack([rng.uniform(-0.3, 0.3, count), rng.uniform(-0.2, 0.2, count), np.full(count, -1.0)], -1)
-
-
-def test_key_images_are_as_far_apart_as_asked():
-    images = aside(*np.arange(9) * 0.01)
-    assert key_images(images, lambda i: wall(), 0.0201) == [0, 2, 4, 6, 8]
-    assert key_images(images, lambda i: wall(), 0.0301) == [0, 3, 6, 8]
-    assert key_images(images, lambda i: wall(), 0.009) == list(range(9))
-    assert key_images(images, lambda i: wall(), 1.0) == [0, 8]
-    assert key_images(images, lambda i: wall(5), 1.0) == list(range(9))  # too few points to tell
-    assert key_images(aside(0, 0.5, 1), lambda i: wall(), 0.02) == [0, 1, 2]
-    assert key_images(aside(0.0), lambda i: wall(), 0.02) == [0]
-    # There and back: the order counts, not the places.
-    assert key_images(aside(0, 0.02, 0.04, 0.02, 0), lambda i: wall(), 0.025) == [0, 1, 4]
-    assert key_images(aside(0, 0.5, 0, 0, 0), lambda i: wall(), 0.025) == [0, 1, 2, 4]
-
-
-@pytest.mark.parametrize("something_moves", [False, True])
-def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatch, something_moves):
-    """Of 49 frames every sixth comes first; what moves in one is looked for in others near it, on and on."""
-    view = View(np.zeros((50, 100), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((50, 100), bool))
-    looked_at, compared = [], []
-    shows = {12} | {i for i in range(13, 48) if i % 6}  # which one alone that comes first shows
-    nothing = Depth(*np.zeros((2, 50, 100), np.float32))
-
-    def depths(images, points_of, width, finish, progress, rounds, among):
-        compared.append(among)
-        return iter([Shot(view, np.zeros((50, 100, 3), np.uint8), nothing, None) for _ in images.files])
-
-    def moves(shots, near, i, masks, uprights, first):
-        if first is None:
-            looked_at.append(i)
-            assert not any(mask.any() for mask in masks) and set(near) <= set(range(0, 49, 2))
-        return np.full((50, 100), something_moves and i in shows), "knowledge"
-
-    monkeypatch.setattr(moving, "find_depths", depths)
-    monkeypatch.setattr(moving, "_moves", moves)
-    monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
-    _, masks = find_moving(aside(*np.arange(49) * 0.0099), lambda i: wall())
-    assert compared == [list(range(0, 49, 2))]
-    assert sorted(looked_at[:9]) == [*range(0, 49, 6)]
-    assert len(set(looked_at)) == len(looked_at)
-    if something_moves:
-        assert {i for i, mask in enumerate(masks) if mask.any()} == shows
-    else:
-        assert len(looked_at) == 9
 
 
 def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed_or_a_person(monkeypatch):
