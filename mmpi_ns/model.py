@@ -116,7 +116,16 @@ class MMPIModel(Model):
         metadata, device = self.kwargs.get("metadata", {}), self.kwargs.get("device", "cpu")
         views, observations = metadata.get(TRAINING_VIEWS), metadata.get(OBSERVATIONS)
         self.trains = OBSERVATIONS in metadata
-        windows = self._fitting_plan(views) if self.trains else self._plan(config.placement)
+        windows = self._plan(config.placement)
+        if self.trains:  # fewer texels than the rule would like, where they do not fit in the memory that is free
+            joint, placement = self._is_joint(windows), config.placement
+            work = Work(
+                config.colour.feature_channels, not joint, metadata[RAYS_PER_STEP], config.sampling.threshold,
+                all_mpis=not joint and config.schedule.rays_per_mpi == "all",
+            )  # fmt: skip
+            fixed = config.plan_file is not None or placement.arrangement != "automatic"
+            again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))
+            windows = fit_memory(windows, lambda window: views_of(window, views), work, device, again)
         phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
         count = len(windows)
         schedule = make_schedule(phases, max(1, config.total_steps), count, metadata.get(DEPTHS_KNOWN, False))
@@ -146,21 +155,6 @@ class MMPIModel(Model):
     def _is_joint(self, windows: WindowedPlan) -> bool:
         """Whether all MPIs train in one go. One head has nothing to blend with."""
         return self.config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
-
-    def _fitting_plan(self, views: TrainingViews | None) -> WindowedPlan:
-        """The plan, with fewer texels than the rule would like where they do not fit in the memory that is free."""
-        config = self.config
-        windows, placement, schedule = self._plan(config.placement), config.placement, config.schedule
-        joint, rays = self._is_joint(windows), self.kwargs["metadata"][RAYS_PER_STEP]
-        work = Work(
-            config.colour.feature_channels, not joint, rays, config.sampling.threshold,
-            all_mpis=not joint and schedule.rays_per_mpi == "all",
-        )  # fmt: skip
-        fixed = config.plan_file is not None or placement.arrangement != "automatic"
-        again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))
-        return fit_memory(
-            windows, lambda window: views_of(window, views), work, self.kwargs.get("device", "cpu"), again
-        )
 
     def _plan(self, placement: PlacementConfig) -> WindowedPlan:
         """Scene plan of the option, or of the placement rule for the observations of the training cameras."""

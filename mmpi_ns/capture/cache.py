@@ -106,7 +106,7 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
         if arrays is None:
             result: Any = find()
             try:
-                write_atomically(path, lambda unfinished: _write(unfinished, result))
+                write_atomically(path, lambda unfinished: write_arrays(unfinished, result))
                 arrays = _read(path)
             except OSError as error:
                 CONSOLE.print(f"[yellow]{error}")
@@ -122,7 +122,8 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
     return arrays
 
 
-def _write(path: Path, arrays: Arrays | Pairs) -> None:
+def write_arrays(path: Path, arrays: Arrays | Pairs) -> None:
+    """Writes an .npz, whatever the file's ending."""
     with zipfile.ZipFile(path, "w") as file:  # as np.savez, which asks for all arrays at once
         for name, array in arrays.items() if isinstance(arrays, Mapping) else arrays:
             with file.open(f"{name}.npy", "w", force_zip64=True) as entry:

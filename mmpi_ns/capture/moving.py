@@ -97,18 +97,15 @@ def find_moving(
         shots[i] = replace(shots[i], people=people_in(images, i, shots[i].view, up))
         return _moves(shots, near[i], i, nothing, nothing[i], None)
 
-    def moves_near(i: int) -> bool:
-        return any(masks[j].any() for j in near[i])
-
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
         part = key_images(images, points_of, FIRST)
         while part:
             for i, (mask, knowledge) in zip(part, pool.map(look, part), strict=True):
                 masks[i], first[i] = mask, knowledge
-            part = [i for i in range(len(shots)) if i not in first and moves_near(i)]
+            part = [i for i in range(len(shots)) if i not in first and any(masks[j].any() for j in near[i])]
         uprights = upright_objects(shots, near, masks, pool)
         masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
-        again = [i for i in first if moves_near(i)]
+        again = [i for i in first if any(masks[j].any() for j in near[i])]
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask

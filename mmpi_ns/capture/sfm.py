@@ -131,12 +131,13 @@ def numbers_in_model(files: Sequence[Path], names: Sequence[str]) -> NDArray[np.
     return np.array([numbers[file] if claims[numbers[file]] == 1 else -1 for file in map(Path, files)], np.int64)
 
 
+@dataclass
 class _Reader:
-    """A binary file of COLMAP, which starts with the number of its records; never read past its end."""
+    """A binary file of COLMAP; never read past its end."""
 
-    def __init__(self, path: Path, least: int) -> None:
-        self.name, self.data, self.at = path.name, path.read_bytes(), 0
-        self.records = self.count(least)
+    name: str
+    data: bytes
+    at: int = 0
 
     def take(self, form: str) -> tuple:
         """The next numbers, of this form of ``struct``."""
@@ -157,15 +158,16 @@ def _check_binary_files(folder: Path) -> None:
     """Raises ValueError where a binary file (https://colmap.github.io/format.html) is truncated or names a missing
     record: pycolmap trusts the counts in the files, and would allocate gigabytes or end the process."""
     sizes = {"cameras": 24, "images": 73, "points3D": 51}
-    files = [_Reader(folder / f"{name}.bin", least) for name, least in sizes.items()]
+    files = [_Reader(f"{name}.bin", (folder / f"{name}.bin").read_bytes()) for name in sizes]
+    records = [file.count(least) for file, least in zip(files, sizes.values(), strict=True)]
     cameras, images, points, seen = set(), {}, set(), [np.array([NO_POINT])]
-    for _ in range(files[0].records):
+    for _ in range(records[0]):
         number, model, _, _ = files[0].take("<IiQQ")
         if not 0 <= model < len(PARAMETERS):
             raise ValueError(f"cameras.bin has a camera of model {model}, which is not known")
         files[0].take(f"{8 * PARAMETERS[model]}x")
         cameras.add(number)
-    for _ in range(files[1].records):
+    for _ in range(records[1]):
         number, *_, camera = files[1].take("<I7dI")
         if camera not in cameras:
             raise ValueError(f"images.bin names camera {camera}, which cameras.bin has not")
@@ -176,7 +178,7 @@ def _check_binary_files(folder: Path) -> None:
         images[number] = files[1].count(24)
         begin, _ = files[1].at, files[1].take(f"{24 * images[number]}x")
         seen.append(np.frombuffer(files[1].data, KEYPOINT, images[number], begin)["point"])
-    for _ in range(files[2].records):
+    for _ in range(records[2]):
         points.add(files[2].take("<Q3d3Bd")[0])
         (track,) = files[2].take(f"{8 * files[2].count(8)}s")
         for image, keypoint in struct.iter_unpack("<II", track):

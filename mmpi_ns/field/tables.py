@@ -162,8 +162,8 @@ class TexelTables(Field):
         device = self.density.device
         self.copied = torch.tensor(copied, device=device)
         if tiles is None:
-            reached = self._reachable(self.plan)
-            tiles = head_grids(self.plan)[0].tiles if reached is None else number_tiles(reached)
+            every = head_grids(self.plan)[0].tiles
+            tiles = every if self.views is None else number_tiles(reachable_tiles(self.views, self.plan, device))
         self.tiles = tiles.to(device, copy=True)
         for name in TABLES:
             table = getattr(self, name)
@@ -181,8 +181,9 @@ class TexelTables(Field):
         Surfaces have formed when texels become finer than planned: what lies beyond the middle between a stored texel
         and an empty one stays empty then. Otherwise a rim of tiles would be stored again each time.
         """
-        plan, least = self.full_plan.scaled(factor), MIDDLE if factor > 1 else 0.0
-        return grown_tiles(self.grids, head_grids(plan), self._reachable(plan), least).to(self.density.device)
+        plan, least, device = self.full_plan.scaled(factor), MIDDLE if factor > 1 else 0.0, self.density.device
+        reached = None if self.views is None else reachable_tiles(self.views, plan, device)
+        return grown_tiles(self.grids, head_grids(plan), reached, least).to(device)
 
     @torch.no_grad()
     def grow(self, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
@@ -298,9 +299,6 @@ class TexelTables(Field):
         self.touched, self.peak, self.gain = take_bricks(self.touched, kept), self.peak[kept], self.gain[kept]
         self._packed = {}
         return kept
-
-    def _reachable(self, plan: ScenePlan) -> Bool[Tensor, "T"] | None:
-        return None if self.views is None else reachable_tiles(self.views, plan, self.density.device)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes plan, resolution and tiles from the checkpoint first, so that all shapes fit."""

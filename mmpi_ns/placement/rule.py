@@ -87,8 +87,7 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     if config.arrangement != "automatic":
         arrange = _drive if config.arrangement == "drive" else _room
         return arrange(observations, visible.near, config)
-    trainable = trainable_texel(observations, visible, config, training_rays)
-    budget = affordable_texels(config, training_rays)
+    trainable, budget = texel_limits(observations, visible, config, training_rays)
     finest = max(config.texel_pixels, trainable)
     chosen, texel_pixels = _choose(observations, visible, replace(config, max_texels=budget), finest)
     mpis = tuple(h for h in chosen if isinstance(h, MPIPlan))
@@ -142,20 +141,17 @@ def _room(observations: Observations, content_near: float, config: PlacementConf
     return ScenePlan(tuple(mpis), cube, 0.1 * near, near, "hand-made room")
 
 
-def trainable_texel(
+def texel_limits(
     observations: Observations, visible: VisiblePoints, config: PlacementConfig, training_rays: int | None
-) -> float:
-    """Pixels that a texel must span to meet ``rays_per_texel`` of the training's rays; 0 if these are not known."""
-    if training_rays is None:
-        return 0.0
-    rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
-    return (config.rays_per_texel / (rays_per_pixel * pixels_per_pixel(observations, visible))) ** 0.5
-
-
-def affordable_texels(config: PlacementConfig, training_rays: int | None) -> float:
-    """Texels in all that the settings and the rays of the training allow; 0 for any number."""
+) -> tuple[float, float]:
+    """Pixels that a texel must span to meet ``rays_per_texel`` of the training's rays (0 if these are not known), and
+    texels in all that the settings and these rays allow (0 for any number)."""
     limits = [config.max_texels, config.texels_per_ray * (training_rays or 0)]
-    return min((limit for limit in limits if limit > 0), default=0.0)
+    budget = min((limit for limit in limits if limit > 0), default=0.0)
+    if training_rays is None:
+        return 0.0, budget
+    rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
+    return (config.rays_per_texel / (rays_per_pixel * pixels_per_pixel(observations, visible))) ** 0.5, budget
 
 
 def _choose(

@@ -16,7 +16,6 @@ from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +28,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
 
+from mmpi_ns.capture.cache import write_arrays
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH, seen_details
 from mmpi_ns.scene.near_views import nearest_views
@@ -234,16 +234,12 @@ def write_details(
             "inverse": torch.where(masked, -1.0, 1 / outputs["depth"][..., 0]).half().cpu().numpy(),
         }
         path = folder / f"{i:05d}.npz"
-        write_atomically(path, partial(_save, arrays))
+        write_atomically(path, partial(write_arrays, arrays=arrays))
         size += path.stat().st_size
         rows.append(_camera_row(cameras[i], bundle, kinds[i] == CameraType.FISHEYE.value))
-    write_atomically(folder / CAMERAS_FILE, partial(_save, {"step": np.array(step), "cameras": np.stack(rows)}))
+    arrays = {"step": np.array(step), "cameras": np.stack(rows)}
+    write_atomically(folder / CAMERAS_FILE, partial(write_arrays, arrays=arrays))
     return f"Details of {len(rows)} training images, {size / 2**20:,.0f} MiB, are in {folder}."
-
-
-def _save(arrays: dict[str, NDArray[Any]], path: Path) -> None:
-    with open(path, "wb") as file:  # np.savez would add an ending to the name
-        np.savez(file, **arrays)
 
 
 def _camera_row(camera: Cameras, bundle: RayBundle, fisheye: bool) -> NDArray[np.float32]:

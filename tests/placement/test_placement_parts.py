@@ -235,10 +235,11 @@ def test_the_finest_texels_within_the_budget_are_kept_and_the_coarsest_where_non
 def test_texels_in_all_follow_the_settings_and_the_rays_whichever_allow_fewer():
     config = PlacementConfig(max_texels=2000, texels_per_ray=8)
     wanted = {None: 2000, 1000: 2000, 100: 800}
-    assert {rays: rule.affordable_texels(config, rays) for rays in wanted} == wanted
-    assert rule.affordable_texels(replace(config, max_texels=0), 1000) == 8000
-    assert rule.affordable_texels(replace(config, texels_per_ray=0), 10) == 2000
-    assert rule.affordable_texels(replace(config, max_texels=0), None) == 0
+    scene = side_by_side(1), find_visible_points(side_by_side(1))
+    assert {rays: rule.texel_limits(*scene, config, rays)[1] for rays in wanted} == wanted
+    assert rule.texel_limits(*scene, replace(config, max_texels=0), 1000)[1] == 8000
+    assert rule.texel_limits(*scene, replace(config, texels_per_ray=0), 10)[1] == 2000
+    assert rule.texel_limits(*scene, replace(config, max_texels=0), None)[1] == 0
 
 
 def side_by_side(count: int, depths=(-10.0,)) -> Observations:
@@ -279,9 +280,9 @@ def test_texels_are_as_fine_as_the_rays_of_all_images_that_see_them_train():
     for count in (1, 4, 16):
         observations = side_by_side(count)
         rays = 0.1 * observations.sizes.prod(-1).sum()  # one ray for ten pixels
-        spans[count] = rule.trainable_texel(observations, find_visible_points(observations), config, rays)
+        spans[count], _ = rule.texel_limits(observations, find_visible_points(observations), config, rays)
     assert list(spans.values()) == pytest.approx([50**0.5, 12.5**0.5, 3.125**0.5], rel=0.01)
-    assert rule.trainable_texel(observations, find_visible_points(observations), config, None) == 0
+    assert rule.texel_limits(observations, find_visible_points(observations), config, None)[0] == 0
 
 
 @pytest.mark.parametrize(
