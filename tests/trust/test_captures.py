@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 from forked import run, train
-from PIL import ExifTags, Image
 from tiny_scene import HEIGHT, WIDTH, name_of
 
 NAN, INF = math.nan, math.inf
@@ -267,120 +266,6 @@ def test_images_outside_the_folder_are_allowed_and_said_once(data, edit, tmp_pat
     assert train(data, tmp_path).shown.count("lie outside its folder") == 1
 
 
-# Images --------------------------------------------------------------------------------------------------------------
-
-
-def save(data, i, pixels, **how):
-    Image.fromarray(pixels, **how).save(data / "images" / name_of(i))
-
-
-def smooth(channels):
-    return np.broadcast_to(np.linspace(0, 255, WIDTH)[None, :, None], (HEIGHT, WIDTH, channels)).astype(np.uint8)
-
-
-def one_rgba(data):
-    save(data, 3, smooth(4))
-
-
-def one_gray(data):
-    save(data, 3, smooth(1)[..., 0])
-
-
-def one_palette(data):
-    Image.fromarray(smooth(3)).convert("P").save(data / "images" / name_of(3))
-
-
-def one_cmyk(data):
-    path = data / "images" / name_of(3)
-    Image.fromarray(smooth(4), mode="CMYK").save(path.with_suffix(".jpg"))
-    path.with_suffix(".jpg").rename(path)
-
-
-def sixteen_bits(data):
-    save(data, 3, np.full((HEIGHT, WIDTH), 40_000, np.uint16))
-
-
-@pytest.mark.parametrize("odd", [one_rgba, one_gray, one_palette, one_cmyk, sixteen_bits])
-def test_images_of_other_kinds_among_rgb_train(data, tmp_path, odd):
-    odd(data)
-    assert "Training finished" in train(data, tmp_path).shown
-
-
-def test_16_bit_pixels_become_the_nearest_of_8_bits(data):
-    from training_runs import datamanager
-
-    sixteen_bits(data)
-    image = datamanager(data, test_mode="inference").train_dataset.get_data(2, image_type="uint8")["image"]
-    assert image.shape == (HEIGHT, WIDTH, 3) and (image == 40_000 // 257).all()
-
-
-def float_image(path):
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.float32)).save(path, format="TIFF")
-
-
-DAMAGED = {
-    "missing": lambda p: p.unlink(),
-    "cut short": lambda p: p.write_bytes(p.read_bytes()[:300]),
-    "empty": lambda p: p.write_bytes(b""),
-    "no image": lambda p: p.write_bytes(b"hello"),
-    "a folder": lambda p: (p.unlink(), p.mkdir()),
-    "of floats": float_image,
-}
-
-
-@pytest.mark.parametrize("case", DAMAGED)
-@pytest.mark.parametrize("i", [3, 5])
-def test_an_image_that_cannot_be_read_is_named(data, tmp_path, case, i):
-    DAMAGED[case](data / "images" / name_of(i))
-    said = train(data, tmp_path).sentence
-    assert name_of(i) in said and "cannot be read" in said and "remove its frame" in said
-
-
-def test_an_image_of_another_size_is_named(data, tmp_path):
-    save(data, 3, np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8))
-    said = train(data, tmp_path).sentence
-    assert f"{WIDTH + 2} x {HEIGHT} pixels and its camera {WIDTH} x {HEIGHT}" in said and "EXIF" not in said
-
-
-@pytest.mark.parametrize(("orientation", "named"), [(6, True), (8, True), (3, False)])
-def test_an_image_that_its_exif_alone_turns_is_refused_with_the_reason(data, tmp_path, orientation, named):
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    Image.new("RGB", (HEIGHT, WIDTH)).save(data / "images" / name_of(3), exif=exif)
-    assert ("its EXIF alone turns it" in train(data, tmp_path).sentence) == named
-
-
-ARRAYS = {
-    "a row": np.zeros(7), "empty": np.zeros((0, 0)), "of three channels": np.zeros((HEIGHT, WIDTH, 3)),
-    "of objects": np.array([{"a": 1}], dtype=object), "of texts": np.full((HEIGHT, WIDTH), "a"),
-    "of complex numbers": np.full((HEIGHT, WIDTH), 1j),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", ["missing", "colours", *ARRAYS])
-def test_a_depth_image_that_cannot_be_used_is_named(data, edit, tmp_path, kind):
-    (data / "depths").mkdir()
-    for i in range(8):
-        Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(data / "depths" / name_of(i))
-    edit(lambda meta: [f.update(depth_file_path=f["file_path"].replace("images", "depths")) for f in meta["frames"]])
-    path = data / "depths" / name_of(3)
-    path.unlink()
-    if kind == "colours":
-        Image.fromarray(smooth(3)).save(path)
-    if kind in ARRAYS:
-        path = path.with_suffix(".npy")
-        np.save(path, ARRAYS[kind])
-        edit(lambda meta: meta["frames"][3].update(depth_file_path=f"depths/{path.name}"))
-    assert f"Depth image {path}" in train(data, tmp_path).sentence
-
-
-@pytest.mark.parametrize("factor", [8, 0, -2])
-def test_downscaling_without_copies_says_which_there_are(data, tmp_path, factor):
-    (data / "images_2").mkdir()
-    said = train(data, tmp_path, pipeline__datamanager__dataparser__downscale_factor=factor).sentence
-    assert "--downscale-factor" in said and (factor < 1 or "images_2" in said)
-
-
 # mmpi-plan -----------------------------------------------------------------------------------------------------------
 
 
@@ -412,9 +297,3 @@ def test_mmpi_plan_refuses_what_ns_train_refuses(data, edit, tmp_path, case):
     edit(change)
     said = run("mmpi-plan", data, "--output", tmp_path / "plan").sentence
     assert all(word in said for word in words), said
-
-
-@pytest.mark.parametrize("i", [3, 5])
-def test_mmpi_plan_reads_the_images_as_ns_train_does(data, tmp_path, i):
-    DAMAGED["cut short"](data / "images" / name_of(i))
-    assert name_of(i) in run("mmpi-plan", data, "--output", tmp_path / "plan").sentence
