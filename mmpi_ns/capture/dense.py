@@ -272,7 +272,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
 
 
 def _flow_of_movers() -> Flow:
-    """OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/moving.md)."""
+    """OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/log/moving.md)."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow.setFinestScale(0)
     flow.setVariationalRefinementIterations(0)

@@ -106,15 +106,12 @@ def gather_back_kernel(
                 tl.store(to_shares + number * TAPS + tap, tl.sum(read * down, 1), inside)
 
 
-def sizes(channels: int, device: torch.device, numbers: int = NUMBERS) -> tuple[int, int]:
-    """Columns, and rays or samples, of a program that holds so many numbers."""
+def sizes(channels: int, device: torch.device, numbers: int = NUMBERS) -> tuple[int, int, int]:
+    """Columns, rays or samples, and warps of a program that holds so many numbers: a lane for each ray or sample, so
+    that none repeats what another does."""
     columns = max(4, int(triton.next_power_of_2(channels)))  # colours take three, however few there are
-    return columns, block_size(max(8, numbers // columns), device)
-
-
-def lanes(block: int) -> int:
-    """Warps of a program with so many rays or samples: a lane for each, so that none repeats what another does."""
-    return min(4, max(1, block // 32))
+    block = block_size(max(8, numbers // columns), device)
+    return columns, block, min(4, max(1, block // 32))
 
 
 class _GatherTaps(torch.autograd.Function):
@@ -128,11 +125,12 @@ class _GatherTaps(torch.autograd.Function):
         numbers = torch.full((num_rays, width), -1, dtype=torch.int32, device=device)
         numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32, device=device)
         numbers.masked_fill_(~chosen[:, None], -1)
-        sums, (columns, block) = torch.zeros(num_rays, channels + 1 + COLORS, device=device), sizes(channels, device)
+        sums = torch.zeros(num_rays, channels + 1 + COLORS, device=device)
+        columns, block, warps = sizes(channels, device)
         tensors = (values, numbers, weights, positions, shares, cube_positions, cube_shares, sums)
         launch(
             gather_kernel, num_rays if len(slots) else 0, block, *tensors, num_rays, width, channels, len(positions),
-            HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block, num_warps=lanes(block),
+            HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block, num_warps=warps,
         )  # fmt: skip
         ctx.save_for_backward(*saved)
         parts = split_sums(sums, channels)
@@ -145,7 +143,7 @@ class _GatherTaps(torch.autograd.Function):
         to_sums, _, to_first, to_second = (g.contiguous() for g in grad_outputs)
         needed, channels = ctx.needs_input_grad[0], values.shape[1]
         to_values, to_weights = torch.zeros_like(values) if needed else values, torch.zeros_like(weights)
-        columns, block = sizes(channels, values.device)
+        columns, block, warps = sizes(channels, values.device)
         moved, first = any(ctx.needs_input_grad[5::2]), 0
         to_shares = [torch.zeros_like(x) if moved else to_weights for x in taps[1::2]]  # not written where unmoved
         for positions, shares, to in zip(taps[::2], taps[1::2], to_shares, strict=True):
@@ -153,7 +151,7 @@ class _GatherTaps(torch.autograd.Function):
                 gather_back_kernel, len(positions), block, values, slots, chosen, weights, positions, shares,
                 to_sums, to_first, to_second, to_values, to_weights, to, first, len(positions), weights.shape[1],
                 channels, NEEDED=needed, MOVED=moved, TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block,
-                num_warps=lanes(block),
+                num_warps=warps,
             )  # fmt: skip
             first += len(positions)
         tensors = (x if moved else None for to in to_shares for x in (None, to))

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import ends
-from mmpi_ns.ops.gather.gpu import activate, lanes, sizes
+from mmpi_ns.ops.gather.gpu import activate, sizes
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
@@ -263,12 +263,12 @@ def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays,
     num_rays, channels, device = len(rays.origins), features.shape[1], features.device
     gathered = torch.empty(num_rays, channels, device=device)
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
-    columns, block = sizes(channels, device, NUMBERS)
+    columns, block, warps = sizes(channels, device, NUMBERS)
     launch(
         show_kernel, num_rays, block, m.kept, *m.samples, m.skipped_total, *dense(features),
         grids_of(layout), gathered, mass, depth, median, winner,
         num_rays, m.samples[0].shape[1], channels, len(layout.mpis),
         HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
-        num_warps=lanes(block),
+        num_warps=warps,
     )  # fmt: skip
     return Shown(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, m.dropped_mass)
