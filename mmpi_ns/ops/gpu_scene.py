@@ -29,8 +29,10 @@ BRICK_OF_TILE, TILE_OF_BRICK, INTS = map(tl.constexpr, range(7, 10))
 def grids_of(layout: SceneLayout) -> Int[Tensor, "N"]:
     """Where the texels of every head are, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
     brick of every tile and the tile of every brick."""
-    if "gpu" in layout.packed:
-        return layout.packed["gpu"]
+    return layout.once("gpu", _pack)
+
+
+def _pack(layout: SceneLayout) -> Tensor:
     device, grids, start = layout.frames.origins.device, layout.grids, layout.num_heads * INTS.value
     tiles, places = grids[0].tiles, grids[0].places
     rows = [
@@ -38,8 +40,7 @@ def grids_of(layout: SceneLayout) -> Int[Tensor, "N"]:
         for g, b in zip(grids, layout.bias_starts(), strict=True)
     ]
     head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
-    packed = torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
-    return layout.once("gpu", lambda _: packed)
+    return torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
 
 
 def block_size(size: int, device: torch.device) -> int:
