@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate, max_pool2d, pad
 
 from mmpi_ns.scene.plan import FINER
 from mmpi_ns.scene.texels import BRICK, SIDE, TexelGrid, number_tiles
-from mmpi_ns.utils.pages import empty_table, forget, lazy_zeros
+from mmpi_ns.utils.pages import all_zero, empty_table, forget, lazy_zeros
 
 CHUNK = 1 << 17
 """Texels of an MPI that are resampled at once: for nine channels this takes some 40 MB besides both tables."""
@@ -49,7 +49,7 @@ def move_bricks(table: Shaped[Tensor, "N ..."], kept: Int[Tensor, "K"]) -> Shape
     """The bricks ``kept``, in ascending order, of a table or its moments, which is lost: memory of bricks that were
     passed is given back, so that there is never more of it than for one table and a few bricks."""
     bricks, shape = table.view(-1, BRICK, *table.shape[1:]), (len(kept) * BRICK, *table.shape[1:])
-    if _untrained(table):
+    if all_zero(table):
         return lazy_zeros(shape, table.dtype, table.device)
     moved, passed = empty_table(shape, table.dtype, table.device), 0
     step = max(1, AT_ONCE // (bricks[0].numel() * table.element_size()))
@@ -125,7 +125,7 @@ def resample(
     Texels next to an empty tile extend the stored ones. Planes are processed a few at a time, so only the old and the
     new table need memory.
     """
-    if not empty and _untrained(table):
+    if not empty and all_zero(table):
         return lazy_zeros((int((new[0].tiles > 0).sum() + 1) * BRICK, table.shape[-1]), table.dtype, table.device)
     out = new_table(new[0].tiles, table.shape[-1], empty, table.dtype)
     for source, target in zip(old, new, strict=True):
@@ -141,11 +141,6 @@ def resample(
             value = torch.where(there > 1 - 1e-6, value, value / there.clamp(min=1e-12))
             write_planes(out, target, planes, torch.where(there > 0, value, empty))
     return out
-
-
-def _untrained(table: Shaped[Tensor, "N ..."]) -> bool:
-    """Whether all is 0, as reliability is without a blend phase, which then takes no memory."""
-    return not any(bool(part.any()) for part in table.split(CHUNK))
 
 
 def _chunks(target: TexelGrid) -> Iterator[tuple[slice, slice]]:

@@ -10,6 +10,9 @@ import sys
 import torch
 from torch import Tensor
 
+PART = 1 << 20
+"""Numbers that are looked at together."""
+
 
 def lazy_zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Zeros that take no memory on a CPU until they are written to (torch's are written at once)."""
@@ -34,6 +37,12 @@ def forget(array: Tensor) -> None:
     """Gives back the memory of a contiguous array, or of a part of one, that is not read again; its values are lost."""
     if sys.platform == "linux":
         _advise(array, mmap.MADV_DONTNEED)
+
+
+def all_zero(array: Tensor) -> bool:
+    """Whether an array has no other value, as the reliability of joint training: ends at the first part that has, and
+    without a mark for every number, which ``any`` makes."""
+    return not any(bool(part.any()) for part in array.reshape(-1).split(PART))
 
 
 def _advise(array: Tensor, advice: int) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from mmpi_ns.scene.bricks import AT_ONCE, move_bricks
 from mmpi_ns.scene.texels import BRICK
-from mmpi_ns.utils.pages import empty_table, forget, lazy_zeros
+from mmpi_ns.utils.pages import PART, all_zero, empty_table, forget, lazy_zeros
 
 CPU = torch.device("cpu")
 RESIDENT = """
@@ -97,3 +97,12 @@ class TestOnLinux:
         """
         most, now = numbers_of(work)
         assert most < 30 and now < -90
+
+
+@pytest.mark.parametrize("shape", [(0,), (), (3 * PART, 2), (PART + 1,)])
+def test_all_zero_sees_every_number(shape):
+    array = torch.zeros(shape)
+    assert all_zero(array)
+    if array.numel():
+        array.view(-1)[-1] = -1e-30
+        assert not all_zero(array)
