@@ -110,6 +110,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """How much of the training images moves, in a sentence; empty where nobody looked."""
         self.sources: RaySources | None = None
         """Sources that a step draws from now."""
+        self.share_of_rays = 1.0
+        """Share of the pixel rays that a step draws now, with new views in proportion."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
         self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
@@ -311,7 +313,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.train_count += 1
         if self.sources is None:  # nobody said which window
             self.use_cameras(None)
-        sources, pixel_rays, batch = self.sources, self.get_train_rays_per_batch(), None
+        sources, batch = self.sources, None
+        pixel_rays = max(1, round(self.share_of_rays * self.get_train_rays_per_batch()))
         assert sources is not None
         if not self.training:
             g = generator(self.config.seed, self.train_count, "pixels", self.device)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import Table, weigh_rows
-from mmpi_ns.scene.bricks import grown_tiles, new_table, resample, take_bricks, tiles_with_copies
+from mmpi_ns.scene.bricks import grown_tiles, move_bricks, new_table, resample, tiles_with_copies
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
@@ -215,9 +215,9 @@ class TexelTables(Field):
         for name in TABLES:
             table = getattr(self, name)
             finer = resample(table.data, mpis, copies, EMPTY[name])
-            replace_data(table, torch.cat([finer, take_bricks(table.data, remaining)]))
+            replace_data(table, torch.cat([finer, move_bricks(table.data, remaining)]))
         touched = resample(self.touched[:, None].float(), mpis, copies)
-        self.touched = torch.cat([(touched[:, 0] > 0).to(torch.uint8), take_bricks(self.touched, remaining)])
+        self.touched = torch.cat([(touched[:, 0] > 0).to(torch.uint8), move_bricks(self.touched, remaining)])
         self.tiles, self.plan = number_tiles(torch.cat([fine, kept])), self.plan.with_copies()
         self.copied = torch.ones_like(self.copied)
         self._packed = {}
@@ -265,7 +265,7 @@ class TexelTables(Field):
         """Releases the bricks in which no training sample had the weight ``least``, and resets the records.
 
         Returns:
-            Previous numbers of the remaining bricks (for ``TouchedAdam.keep_blocks``); None if nothing changed, for
+            Previous numbers of the remaining bricks (for ``TouchedAdam.keep_bricks``); None if nothing changed, for
             example because too few rays were seen.
         """
         enough = float(self.crossings) >= ENOUGH_CROSSINGS * self.num_bricks
@@ -295,8 +295,8 @@ class TexelTables(Field):
         self.tiles = numbers[self.tiles.to(torch.int64)].to(torch.int32)
         for name in TABLES:
             table = getattr(self, name)
-            replace_data(table, take_bricks(table.data, kept))
-        self.touched, self.peak, self.gain = take_bricks(self.touched, kept), self.peak[kept], self.gain[kept]
+            replace_data(table, move_bricks(table.data, kept))
+        self.touched, self.peak, self.gain = move_bricks(self.touched, kept), self.peak[kept], self.gain[kept]
         self._packed = {}
         return kept
 

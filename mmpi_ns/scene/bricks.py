@@ -5,22 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d, pad
 
 from mmpi_ns.scene.plan import FINER
 from mmpi_ns.scene.texels import BRICK, SIDE, TexelGrid, number_tiles
-from mmpi_ns.utils.machine import lazy_zeros
+from mmpi_ns.utils.pages import all_zero, empty_table, forget, lazy_zeros
 
 CHUNK = 1 << 17
 """Texels of an MPI that are resampled at once: for nine channels this takes some 40 MB besides both tables."""
+AT_ONCE = 1 << 23
+"""Bytes of the bricks that move at once."""
 
 
 def new_table(tiles: Int[Tensor, "T"], channels: int, empty: float = 0.0, dtype=torch.float32) -> Float[Tensor, "N C"]:
     """A table of zeros with a brick for every stored tile; the empty brick contains ``empty``."""
     bricks = int((tiles > 0).sum()) + 1
-    table = torch.zeros(bricks * BRICK, channels, dtype=dtype, device=tiles.device)
+    table = empty_table((bricks * BRICK, channels), dtype, tiles.device).zero_()
     table[:BRICK] = empty
     return table
 
@@ -43,9 +45,21 @@ def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, im
     table.view(-1, SIDE, SIDE, table.shape[-1])[tiles[stored].to(torch.int64)] = blocks[stored]
 
 
-def take_bricks(table: Float[Tensor, "N C"], kept: Int[Tensor, "K"]) -> Float[Tensor, "M C"]:
-    """The chosen bricks of a table."""
-    return table.view(-1, BRICK, *table.shape[1:])[kept].flatten(0, 1)
+def move_bricks(table: Shaped[Tensor, "N ..."], kept: Int[Tensor, "K"]) -> Shaped[Tensor, "M ..."]:
+    """The bricks ``kept``, in ascending order, of a table or its moments, which is lost: memory of bricks that were
+    passed is given back, so that there is never more of it than for one table and a few bricks."""
+    bricks, shape = table.view(-1, BRICK, *table.shape[1:]), (len(kept) * BRICK, *table.shape[1:])
+    if all_zero(table):
+        return lazy_zeros(shape, table.dtype, table.device)
+    moved, passed = empty_table(shape, table.dtype, table.device), 0
+    step = max(1, AT_ONCE // (bricks[0].numel() * table.element_size()))
+    for start in range(0, len(kept), step):
+        part = kept[start : start + step]
+        torch.index_select(bricks, 0, part, out=moved.view(-1, *bricks.shape[1:])[start : start + step])
+        last = int(part[-1]) + 1
+        forget(bricks[passed:last])
+        passed = last
+    return moved
 
 
 def grown_tiles(
@@ -111,7 +125,7 @@ def resample(
     Texels next to an empty tile extend the stored ones. Planes are processed a few at a time, so only the old and the
     new table need memory.
     """
-    if not empty and not bool(table.any()):  # untrained reliability takes no memory
+    if not empty and all_zero(table):
         return lazy_zeros((int((new[0].tiles > 0).sum() + 1) * BRICK, table.shape[-1]), table.dtype, table.device)
     out = new_table(new[0].tiles, table.shape[-1], empty, table.dtype)
     for source, target in zip(old, new, strict=True):

@@ -24,6 +24,7 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import InputError, brief, quoted
 from mmpi_ns.utils.files import to_text, write_atomically, write_errors
+from mmpi_ns.utils.pages import all_zero
 from mmpi_ns.utils.values import shown
 
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "capture"}
@@ -134,7 +135,7 @@ def states_of(pipeline: nn.Module, optimizers: Mapping[str, Optimizer], goes_on:
     half of all, nor more digits than images show."""
     state = pipeline.state_dict() if goes_on else in_half_precision(pipeline.state_dict())
     # A tensor of zeros alone, as untrained reliability, takes one number.
-    zeros = {k: v.new_zeros(()).expand(v.shape) for k, v in state.items() if v.numel() > 1 and not v.any()}
+    zeros = {k: v.new_zeros(()).expand(v.shape) for k, v in state.items() if v.numel() > 1 and all_zero(v)}
     unused: dict[str, Any] = {} if goes_on else {"state": {}}
     moments = {k: v.state_dict() | unused for k, v in optimizers.items()}
     return {"pipeline": {**state, **zeros}, "optimizers": moments}

@@ -18,6 +18,8 @@ Training = Literal["two-phase", "joint"]
 
 SOONER = 4
 """Texels double so many times as early where depths are known, and surfaces need not form."""
+GROWING_SHARE = 0.5
+"""Share of the batch drawn while texels grow from known surfaces, when rays cost most and coarse texels need few."""
 COPIES_FROM = 0.75
 """Share of the time of high rates after which MPIs may get finer copies."""
 TRAINS: dict[str, frozenset[str]] = {
@@ -83,6 +85,8 @@ class Schedule:
     release: tuple[int, ...] = ()
     """Steps before which empty bricks are released, judging by the samples since the previous such step or the last
     growth."""
+    growing_share: float = 1.0
+    """Share of the batch drawn while resolution grows."""
 
     @property
     def is_joint(self) -> bool:
@@ -125,6 +129,10 @@ class Schedule:
     @property
     def _sharp_from(self) -> int:
         return self.growth[-1] if self.growth else self.phases[0].end // 10
+
+    def share_of_rays(self, step: int) -> float:
+        """Share of the batch that a step draws."""
+        return 1.0 if self.sharpened(step) else self.growing_share
 
     def releases_at(self, step: int) -> bool:
         """Whether bricks are released before this step."""
@@ -196,7 +204,8 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, de
     doublings = {s: s / SOONER if depths_known else s for s in config.growth_shares}
     growth = tuple(max(1, round(s * first)) for s in doublings.values())
     rates = float(config.decay_decades), float(config.decay_from), float(config.finetune_rate)
-    schedule = Schedule(phases, growth, *rates, windows)
+    share = GROWING_SHARE if depths_known else 1.0
+    schedule = Schedule(phases, growth, *rates, windows, growing_share=share)
     release = (
         sorted({round(doublings.get(s, s) * first) for s in config.release_shares}) if config.release_weight > 0 else []
     )

@@ -173,6 +173,7 @@ class TrainingRun:
         if attributes is not None and attributes.pipeline is not None:
             manager = attributes.pipeline.datamanager
             assert isinstance(manager, MMPIDataManager), "training needs MMPIDataManager"
+            manager.share_of_rays = schedule.share_of_rays(step)
             if self._drawn_from != window:
                 centers, windows = manager.observations.centers, progress.windows.windows
                 manager.use_cameras(cameras_of(windows[window], centers) if len(windows) > 1 else None)

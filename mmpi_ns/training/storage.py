@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 from mmpi_ns.field.tables import TABLES, TexelTables
 from mmpi_ns.scene.bricks import tiles_with_copies
 from mmpi_ns.scene.plan import FINER, MOST_TEXELS
-from mmpi_ns.scene.texels import BRICK, head_shapes
+from mmpi_ns.scene.texels import head_shapes
 from mmpi_ns.training.memory import Work, stored_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import say
@@ -61,7 +61,7 @@ def prepare_storage(
     for kept in remaining:
         gain = gain if gain is None or kept is None else gain[kept]
         for optimizer, table in trained if kept is not None else ():
-            optimizer.keep_blocks(table, kept, BRICK)
+            optimizer.keep_bricks(table, kept)
     if schedule.refines_at(step) and field.num_copies == 0:
         work = Work(field.feature_channels, two_phase=not schedule.is_joint)
         budget = training_bytes(field.full_plan, field.views, work, field.density.device)

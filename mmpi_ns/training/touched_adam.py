@@ -16,7 +16,8 @@ from torch.nn import Parameter
 
 from mmpi_ns.ops.adam import AdamConstants, adam, adam_rows
 from mmpi_ns.ops.interpolate import Table
-from mmpi_ns.utils.machine import lazy_zeros
+from mmpi_ns.scene.bricks import move_bricks
+from mmpi_ns.utils.pages import lazy_zeros
 
 
 class TouchedAdam(torch.optim.Optimizer):
@@ -58,12 +59,11 @@ class TouchedAdam(torch.optim.Optimizer):
                     for tensor, new in zip(old, adam(*old, param.grad, constants), strict=True):
                         tensor.copy_(new)
 
-    def keep_blocks(self, param: Parameter, kept: Tensor, size: int) -> None:
-        """Keeps the moments of the blocks ``kept`` [K] of a table, of ``size`` rows each, in that order."""
+    def keep_bricks(self, param: Parameter, kept: Tensor) -> None:
+        """Keeps the moments of the bricks ``kept`` [K] of a table, in ascending order."""
         state = self.state.get(param, {})
         if "moments" in state:
-            moments = state["moments"]
-            state["moments"] = moments.view(-1, size, *moments.shape[1:])[kept].flatten(0, 1)
+            state["moments"] = move_bricks(state["moments"], kept)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads the state without torch's conversion of moments to the precision of their parameters."""

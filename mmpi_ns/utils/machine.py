@@ -9,9 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import torch
-from torch import Tensor
 
 CGROUP = Path("/sys/fs/cgroup")
 STAT = Path("/proc/stat")
@@ -20,13 +18,6 @@ DRIVERS = {13: 580, 12: 525, 11: 450}
 """Series of NVIDIA's driver that a major version of CUDA needs at least."""
 WHEELS = {12: "cu126", 11: "cu118"}
 """Builds of torch for CUDA versions that older drivers know."""
-
-
-def lazy_zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Zeros that take no memory on a CPU until they are written to (torch's are written at once)."""
-    if device.type != "cpu":
-        return torch.zeros(shape, dtype=dtype, device=device)
-    return torch.from_numpy(np.zeros((*shape, dtype.itemsize), dtype=np.uint8)).view(dtype).squeeze(-1)
 
 
 def free_memory(device: str | torch.device) -> int:

@@ -69,6 +69,14 @@ def test_rays_drawn_ahead_are_those_of_the_step_whatever_comes_between(scene, ma
         torch.set_num_threads(1)
 
 
+def test_a_share_of_the_rays_is_drawn_if_asked_for(scene):
+    manager = datamanager(scene)
+    for share, count in ((0.5, 32), (1.0, 64), (0.0, 1)):
+        manager.share_of_rays = share
+        rays, batch = manager.next_train(0)
+        assert len(batch["indices"]) == count and len(rays) == count + 16
+
+
 def test_a_batch_holds_the_colours_of_the_pixels_that_its_rays_pass(manager):
     rays, batch = manager.next_train(0)
     assert len(rays) == 64 + 16 and batch["image"].shape == (64, 3)

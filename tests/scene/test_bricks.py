@@ -314,7 +314,7 @@ def test_moments_and_marks_follow_their_texels():
     stays = field.peak[old_rows // BRICK] >= 0.5
     kept = field.release_unused(0.5)
     for table in tables.values():
-        optimizer.keep_blocks(table, kept, BRICK)
+        optimizer.keep_bricks(table, kept)
     states = [optimizer.state[t]["moments"] for t in tables.values()]
     after = [by_texel(field.grids, t) for t in (*tables.values(), *states, field.touched)]
     assert 0 < field.num_bricks < count and all(tables[n] is getattr(field, n) for n in TABLES)

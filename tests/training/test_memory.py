@@ -123,7 +123,7 @@ def test_what_steps_leave_is_given_back_before_tables_grow_and_zeros_take_nothin
         from mmpi_ns.scene.bricks import resample
         from mmpi_ns.scene.texels import BRICK, make_grids
         from mmpi_ns.utils.host import give_back_freed_memory, keep_freed_memory
-        from mmpi_ns.utils.machine import lazy_zeros
+        from mmpi_ns.utils.pages import lazy_zeros
         def resident():
             return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") >> 20
         (keeping := keep_freed_memory()).__enter__()

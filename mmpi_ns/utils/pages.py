@@ -1,0 +1,55 @@
+"""Pages of large arrays on a CPU: large ones for tables, none for what is not written, and given back early."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import mmap
+import sys
+
+import torch
+from torch import Tensor
+
+PART = 1 << 20
+"""Numbers that are looked at together."""
+
+
+def lazy_zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Zeros that take no memory on a CPU until they are written to (torch's are written at once)."""
+    count = math.prod(shape)
+    if device.type != "cpu" or sys.platform != "linux" or not count:
+        return torch.zeros(shape, dtype=dtype, device=device)
+    # Memory of malloc would be zeroed by hand where it was used before.
+    memory = mmap.mmap(-1, count * dtype.itemsize, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    return torch.frombuffer(memory, dtype=dtype, count=count).view(shape)
+
+
+def empty_table(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """An array that is not written yet, in large pages if the system has any: rows that are read at random then need
+    fewer of the processor's page tables."""
+    table = torch.empty(shape, dtype=dtype, device=device)
+    if sys.platform == "linux":
+        _advise(table, mmap.MADV_HUGEPAGE)
+    return table
+
+
+def forget(array: Tensor) -> None:
+    """Gives back the memory of a contiguous array, or of a part of one, that is not read again; its values are lost."""
+    if sys.platform == "linux":
+        _advise(array, mmap.MADV_DONTNEED)
+
+
+def all_zero(array: Tensor) -> bool:
+    """Whether an array has no other value, as the reliability of joint training: ends at the first part that has, and
+    without a mark for every number, which ``any`` makes."""
+    return not any(bool(part.any()) for part in array.reshape(-1).split(PART))
+
+
+def _advise(array: Tensor, advice: int) -> None:
+    """madvise for the whole pages of a contiguous array on a CPU. What the kernel does not follow changes nothing."""
+    if array.device.type != "cpu":
+        return
+    start, page = array.data_ptr(), mmap.PAGESIZE
+    first, end = -(-start // page) * page, (start + array.numel() * array.element_size()) // page * page
+    if end > first:
+        ctypes.CDLL(None).madvise(ctypes.c_void_p(first), ctypes.c_size_t(end - first), advice)
