@@ -91,7 +91,7 @@ def masked_shares(data: Path, downscale_factor: int) -> Row:
     config.dataparser.downscale_factor = downscale_factor
     manager = config.setup(device="cpu", test_mode="val")
     dataset, start = manager.train_dataset, time.process_time()
-    masks = moving_masks(manager.observations, dataset)
+    masks, _ = moving_masks(manager.observations, dataset)
     seconds = (time.process_time() - start) / len(masks)
     row: Row = {"images": len(masks), "seconds_an_image": seconds}
     row |= {"masked": mean_of(masks), "most": max(float(mask.mean()) for mask in masks)}

@@ -148,11 +148,13 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
             if self.config.mask_moving and None in dataset.mask_files:
                 # A mask file of the user wins over what is seen to move.
-                masks = zip(moving_masks(self.observations, dataset), dataset.mask_files, strict=True)
-                masks = [mask & (file is None) for mask, file in masks]
+                masks, doubt = moving_masks(self.observations, dataset)
+                masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
                 self.moves = share_of_moving(masks)
                 is_masked = any(mask.any() for mask in masks)
                 say(self.moves + (" (--pipeline.datamanager.mask-moving False keeps them)." if is_masked else "."))
+                if doubt:
+                    say(doubt, "yellow")
                 if is_masked:
                     dataset.moving = masks
                     self.observations = drop_masked(self.observations, dataset)

@@ -24,6 +24,7 @@ from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Progress, find_depths
 from mmpi_ns.capture.moving_carry import carried
+from mmpi_ns.capture.moving_doubt import doubt_of
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
 from mmpi_ns.capture.moving_follow import upright_objects
 from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
@@ -57,7 +58,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 11
+VERSION = 12
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -71,8 +72,9 @@ def find_moving(
     images: PosedImages,
     points_of: Callable[[int], NDArray[np.float64]],
     progress: Progress = lambda work, _: work,
-) -> tuple[list[View], list[Mask]]:
-    """Views of images at working size, and masks of what moves in them; the number of threads does not change it.
+) -> tuple[list[View], list[Mask], str]:
+    """Views of images at working size, masks of what moves in them, and why these are doubtful, if they are, in a
+    sentence; the number of threads does not change it.
 
     Args:
         images: the originals.
@@ -112,7 +114,7 @@ def find_moving(
     # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         masks = [np.zeros_like(mask) for mask in masks]
-    return [shot.view for shot in shots], masks
+    return [shot.view for shot in shots], masks, doubt_of(shots, up, masks)
 
 
 def neighbours(images: PosedImages, i: int, keys: Sequence[int]) -> list[int]:
@@ -155,12 +157,13 @@ def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[i
     return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE
 
 
-def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[Mask]:
-    """What moves in each training image [H, W], from the cache if possible; nothing where lenses cannot be undone."""
+def moving_masks(observations: Observations, dataset: MMPIDataset) -> tuple[Sequence[Mask], str]:
+    """What moves in each training image [H, W], and the doubt of ``find_moving``, from the cache if possible; nothing
+    where lenses cannot be undone."""
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
     posed = posed_images(observations, dataset)
     if posed is None:
-        return [np.zeros(shape, bool) for shape in shapes]
+        return [np.zeros(shape, bool) for shape in shapes], ""
     original, (seen_by, points) = at_full_size(posed), observations.tracked
 
     def find() -> Arrays:
@@ -168,14 +171,14 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
         deque(in_order(lambda i: dataset.get_data(i, image_type="uint8"), range(len(dataset))), maxlen=0)
         forecast = duration(SECONDS * len(shapes) / num_threads())
         CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {forecast}.")
-        views, masks = find_moving(
+        views, masks, doubt = find_moving(
             original, lambda i: points[seen_by == i],
             progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),
         )  # fmt: skip
         return {
             f"{i}": np.packbits(in_image(v, m, original, i, s) if m.any() else np.zeros(s, bool))
             for i, (v, m, s) in enumerate(zip(views, masks, shapes, strict=True))
-        }
+        } | {"doubt": np.frombuffer(doubt.encode(), np.uint8)}
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     lacks = () if has_detector() else ("people",)
@@ -185,7 +188,7 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
         height, width = shapes[i]
         return np.unpackbits(np.asarray(stored[f"{i}"], np.uint8), count=height * width).reshape(height, width) > 0
 
-    return Computed(len(shapes), unpacked)
+    return Computed(len(shapes), unpacked), bytes(np.asarray(stored["doubt"], np.uint8)).decode()
 
 
 def share_of_moving(masks: Sequence[Mask]) -> str:

@@ -27,17 +27,17 @@ def write_masks(
     target: Path,
     picture: Path,
     threads: int,
-) -> dict[str, float]:
+) -> tuple[dict[str, float], str]:
     """Finds what moves in the training images, which alone are compared; where anything does, writes a mask for each
     photo, ``target/NAME.png``, white where used and of test images, and a picture.
 
-    Returns the share that is masked of each image in which something moves, by name.
+    Returns the share that is masked of each image in which something moves, by name, and the doubt of ``find_moving``.
     """
     if threads > 0:
         torch.set_num_threads(threads)
     entries = [model.images[i] for i in sorted(model.reg_image_ids()) if model.images[i].name in set(train)]
     posed = _posed_images(model, entries, images)
-    views, moving = find_moving(
+    views, moving, doubt = find_moving(
         posed,
         lambda i: np.reshape(
             [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()], (-1, 3)
@@ -45,7 +45,7 @@ def write_masks(
         lambda work, count: track(work, "Looking for what moves", count, console=CONSOLE),
     )
     if not any(mask.any() for mask in moving):
-        return {}
+        return {}, doubt
     target.mkdir(parents=True, exist_ok=True)
     number, shares = {entry.name: i for i, entry in enumerate(entries)}, {}
     for photo in photos:
@@ -58,7 +58,7 @@ def write_masks(
         Image.fromarray(np.where(mask, 0, 255).astype(np.uint8)).save(target / f"{photo.name}.png")
     colors = ((entry.name, straightened_color(posed, i, views[i])) for i, entry in enumerate(entries))
     draw_moving(picture, colors, moving)
-    return shares
+    return shares, doubt
 
 
 def _posed_images(model: pycolmap.Reconstruction, entries: Sequence[pycolmap.Image], folder: Path) -> PosedImages:

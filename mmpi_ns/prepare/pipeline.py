@@ -280,7 +280,8 @@ class Preparation:
         from mmpi_ns.prepare.moving import write_masks  # imports nerfstudio, which takes seconds
 
         target, picture = self.work / "moving", built / "report" / "moving.jpg"
-        moves = write_masks(model, photos, split.train, self.image_folder, target, picture, s.threads)
+        moves, doubt = write_masks(model, photos, split.train, self.image_folder, target, picture, s.threads)
+        findings += [checks.Finding("moving?", "", doubt)] if doubt else []
         if not moves:
             return findings, None, "nothing is seen to move"
         moving, fate = sum(moves.values()) / len(split.train), "are masked" if s.moving == "mask" else "move"

@@ -64,7 +64,7 @@ def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatc
     monkeypatch.setattr(moving, "find_depths", depths)
     monkeypatch.setattr(moving, "_moves", moves)
     monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
-    _, masks = find_moving(aside(*np.arange(49) * 0.0099), lambda i: wall())
+    _, masks, _ = find_moving(aside(*np.arange(49) * 0.0099), lambda i: wall())
     assert compared == [list(range(0, 49, 2))]
     assert sorted(looked_at[:9]) == [*range(0, 49, 6)]
     assert len(set(looked_at)) == len(looked_at)

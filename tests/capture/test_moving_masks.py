@@ -78,7 +78,7 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     poses = np.tile(np.eye(4)[:3], (3, 1, 1))
     poses[:, 0, 3] = range(3)
     images = PosedImages((Path("x"),) * 3, poses, np.ones((3, 4)), np.tile([50.0, 20], (3, 1)), np.zeros((3, 4)))
-    _, masks = find_moving(images, lambda i: np.zeros((0, 3)))
+    _, masks, _ = find_moving(images, lambda i: np.zeros((0, 3)))
     assert [int(mask.sum()) for mask in masks] == ([3, 16, 3] if large else [0, 0, 0])
 
 

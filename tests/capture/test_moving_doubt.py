@@ -1,0 +1,68 @@
+"""When masks of a drive are called doubtful: shots of a level road, rendered as depths alone."""
+
+import numpy as np
+import pytest
+
+from mmpi_ns.capture.dense import Depth
+from mmpi_ns.capture.moving_doubt import MANY, SUNK, doubt_of, share_sunk
+from mmpi_ns.capture.moving_evidence import Shot
+from mmpi_ns.capture.views import View
+
+UP = np.array([0.0, 0.0, 1.0])
+FACING = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
+"""Right, up and back of a camera in the world that looks along the first axis."""
+AHEAD, ASIDE = np.eye(3), np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+HEIGHT, SHAPE = 1.5, (40, 60)
+
+
+def shots_of(count=MANY, sunken=0.0, heights=HEIGHT, turn=AHEAD, has_ground=True, known=1.0, seed=0):
+    """A drive along the first axis; a share of the road's pixels, which are noisy, belongs to cars with the speed
+    0.9 of the camera's, which seem ten times as far."""
+    random, shots = np.random.default_rng(seed), []
+    for i, height in enumerate(np.broadcast_to(heights, count)):
+        rows, _ = np.mgrid[:40, :60] + 0.5
+        down = (rows - 20) / 30
+        inverse = np.where(down > 0, down / height, 0.02) * random.normal(1, 0.03, SHAPE)
+        inverse[(random.random(SHAPE) < sunken) & (down > 0)] *= 0.1
+        inverse[random.random(SHAPE) >= known] = 0
+        pose = np.concatenate([FACING @ turn, [[float(i)], [0], [height]]], 1)
+        view = View(np.zeros(SHAPE, np.uint8), np.array([30.0, 30, 30, 20]), pose, np.ones(SHAPE, bool))
+        depth = Depth(inverse.astype(np.float32), np.full(SHAPE, 0.01, np.float32))
+        ground = np.maximum(down / height, 0).astype(np.float32) if has_ground else None
+        shots.append(Shot(view, np.zeros((*SHAPE, 3), np.uint8), depth, ground))
+    return shots
+
+
+def sunk(shots, masks=None):
+    return share_sunk(shots, UP, masks or [np.zeros(SHAPE, bool) for _ in shots])
+
+
+def doubt(shots, masks=None):
+    return doubt_of(shots, UP, masks or [np.zeros(SHAPE, bool) for _ in shots])
+
+
+@pytest.mark.parametrize("sunken", [0.0, 0.03, 0.2, 0.4])
+def test_the_share_that_lies_below_the_road_is_told_and_doubted(sunken):
+    shots = shots_of(sunken=sunken)
+    assert sunk(shots) == pytest.approx(sunken, abs=0.02)
+    assert bool(doubt(shots)) == (sunken > SUNK)
+    assert sunken < SUNK or f"{sunk(shots):.0%} of what lies below" in doubt(shots)
+
+
+def test_what_is_masked_is_not_doubted():
+    shots = shots_of(sunken=0.3)
+    masks = [shot.depth.inverse < 0.5 * shot.ground for shot in shots]
+    assert sunk(shots, masks) == 0 and not doubt(shots, masks)
+
+
+def test_where_no_height_of_the_camera_stands_out_nothing_is_said():
+    assert sunk(shots_of(heights=HEIGHT * 1.6 ** np.arange(MANY))) == 0
+    assert sunk(shots_of(known=0.02)) == 0, "few depths"
+    assert not doubt(shots_of(MANY - 1, sunken=0.4)), "few shots"
+
+
+def test_a_drive_without_a_road_is_doubted_and_a_camera_that_looks_aside_is_not():
+    blind = shots_of(known=0.0, has_ground=False)
+    assert f"the road is found in 0 of {MANY} images" in doubt(blind)
+    assert not doubt(shots_of(MANY // 4) + blind[MANY // 4 :]), "found in a quarter"
+    assert not doubt(shots_of(turn=ASIDE, known=0.0, has_ground=False))
