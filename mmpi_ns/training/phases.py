@@ -18,8 +18,9 @@ Training = Literal["two-phase", "joint"]
 
 SOONER = 4
 """Texels double so many times as early where depths are known, and surfaces need not form."""
-GROWING_SHARE = 0.5
-"""Share of the batch drawn while texels grow from known surfaces, when rays cost most and coarse texels need few."""
+GROWING_SHARE, FULL_STEPS = 0.5, 1250
+"""Share of the batch drawn while texels grow from known surfaces, when rays cost most and coarse texels need few. Runs
+of at most so many steps draw all, those in between as many in all as these (docs/log/performance.md)."""
 COPIES_FROM = 0.75
 """Share of the time of high rates after which MPIs may get finer copies."""
 TRAINS: dict[str, frozenset[str]] = {
@@ -204,7 +205,7 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, de
     doublings = {s: s / SOONER if depths_known else s for s in config.growth_shares}
     growth = tuple(max(1, round(s * first)) for s in doublings.values())
     rates = float(config.decay_decades), float(config.decay_from), float(config.finetune_rate)
-    share = GROWING_SHARE if depths_known else 1.0
+    share = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if depths_known else 1.0
     schedule = Schedule(phases, growth, *rates, windows, growing_share=share)
     release = (
         sorted({round(doublings.get(s, s) * first) for s in config.release_shares}) if config.release_weight > 0 else []

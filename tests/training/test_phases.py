@@ -154,6 +154,8 @@ def test_half_of_the_batch_is_drawn_while_texels_grow_from_known_surfaces():
     assert known.growth[-1] == 200 and shares == 2 * (200 * [0.5] + 2_800 * [1.0])
     assert all(fog.share_of_rays(step) == 1.0 for step in range(6_000))
     assert Schedule.from_json(known.to_json()).share_of_rays(0) == 0.5
+    short = [make_schedule(ScheduleConfig(), n, depths_known=True).share_of_rays(0) for n in (1, 1_250, 2_000, 2_500)]
+    assert short == [1.0, 1.0, 0.625, 0.5]
     text = json.loads(known.to_json())
     del text["growing_share"]
     assert Schedule.from_json(json.dumps(text)).share_of_rays(0) == 1.0, "of a run of an earlier version"
