@@ -57,7 +57,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 11
+VERSION = 12
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -84,8 +84,9 @@ def find_moving(
 
     def shot_of(i: int, view: View, depth: Depth) -> Shot:
         color = cv2.GaussianBlur(straightened_color(images, i, view), (0, 0), 1.0)
-        ground = ground_of(view, depth, up)
-        return Shot(view, np.asarray(color, np.uint8), depth, ground, None if ground is None else horizon_of(view, up))
+        ground, level = ground_of(view, depth, up), horizon_of(view, up)
+        horizon = None if ground is None else level
+        return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon, level=level)
 
     keys = key_images(images, points_of, COMPARED)
     shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS, keys))

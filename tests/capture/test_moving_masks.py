@@ -334,6 +334,18 @@ def test_an_object_that_seeds_hardly_cover_is_none(apart, kept):
     assert grown(*a_scene(np.full((*SIZE, 3), 200, np.uint8)), core).any() == kept
 
 
+@pytest.mark.parametrize(("row", "moves"), [(20, True), (40, False), (None, True)])
+def test_what_hangs_above_the_height_of_the_camera_is_none(row, moves):
+    """A branch before the sky, or a car; nothing is left out by it where the camera looks steeply down."""
+    core = np.zeros(SIZE, bool)
+    core[15:38, 20:40] = True
+    color = np.full((*SIZE, 3), 60, np.uint8)
+    color[core] = 200
+    shot, shown = a_scene(color)
+    level = None if row is None else np.full(SIZE[1], float(row))
+    assert grown(replace(shot, level=level), shown, core).any() == moves
+
+
 @pytest.mark.parametrize("silent", [True, False], ids=["nothing is said", "all is judged"])
 def test_an_object_reaches_on_to_the_border_where_neighbours_say_nothing(silent):
     """A car of one colour that leaves at the left and below; seeds lie on its right end."""
