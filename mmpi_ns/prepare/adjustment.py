@@ -119,7 +119,10 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
         for says, is_lens in trials:
             trial = adjusted(light, is_lens, center or not is_lens)
             advance()
-            before, after = error_of(light), error_of(trial)
+            # Root mean squares of the points' errors, each counted once for each image that sees it.
+            points = [[(p.error, p.track.length()) for p in m.points3D.values()] for m in (light, trial)]
+            columns = (np.array(rows, np.float64).reshape(-1, 2).T for rows in points)
+            before, after = (float(np.sqrt((e**2 * n).sum() / max(n.sum(), 1))) for e, n in columns)
             stretch = max(abs(c.focal_length_x / c.focal_length_y - 1) for c in trial.cameras.values())
             is_better, fate = after < WORTH * before, "not kept"
             if is_better and stretch >= SQUARE:
@@ -129,13 +132,6 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
             if is_better:
                 light, center, four_terms = trial, center or not is_lens, four_terms or is_lens
     return adjusted(model, four_terms, center) if center or four_terms else model
-
-
-def error_of(model: pycolmap.Reconstruction) -> float:
-    """Root mean square of the points' errors, each counted once for each image that sees it; pixels."""
-    rows = [(point.error, point.track.length()) for point in model.points3D.values()]
-    error, count = np.array(rows, np.float64).reshape(-1, 2).T
-    return float(np.sqrt((error**2 * count).sum() / max(count.sum(), 1)))
 
 
 def quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:

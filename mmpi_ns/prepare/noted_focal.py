@@ -1,5 +1,5 @@
-"""The focal length that EXIF notes, where the images hardly determine it: on a level flight over flat ground, a longer
-lens from higher up shows the same."""
+"""The focal length that EXIF notes, where the images hardly determine it: if all cameras look the same way and move
+across it, as on a level flight, everything twice as far away through a lens twice as long shows the same."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import copy
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
-from mmpi_ns.prepare.adjustment import adjust, error_of, with_fewer_points
+from mmpi_ns.prepare.adjustment import LARGEST_ERROR, adjust, with_fewer_points
 from mmpi_ns.utils.errors import say
 
 OFF, WORTH, ROUNDS = 0.1, 0.95, 3
@@ -45,9 +46,15 @@ def is_focal_open(model: pycolmap.Reconstruction, noted: Mapping[int, float], th
         return False
     light = with_fewer_points(model)
     adjust(light, threads, lens=True)
-    free, held = error_of(light), error_of(with_focals(light, noted, threads))
+    free, held = _error_of(light), _error_of(with_focals(light, noted, threads))
     is_open = free > WORTH * held
     focals = ", ".join(f"{focal:.0f}" for _, focal in sorted(noted.items())[:3])
     fate = "kept, as the images hardly determine it" if is_open else "not kept"
     say(f"Lens: {free:.3f} px, {held:.3f} px with the focal length of EXIF ({focals} px): {fate}.")
     return is_open
+
+
+def _error_of(model: pycolmap.Reconstruction) -> float:
+    """Root mean square of the points' errors in pixels, where single points that are lost count little."""
+    errors = np.array([min(point.error, LARGEST_ERROR) for point in model.points3D.values()])
+    return float(np.sqrt((errors**2).mean()))
