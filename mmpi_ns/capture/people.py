@@ -62,13 +62,12 @@ def level_up(rights: Float[ndarray, "M 3"], up: Float[ndarray, "3"]) -> Float[nd
 
 
 def upright(camera_to_worlds: Float[ndarray, "M 3 4"]) -> Float[ndarray, "3"]:
-    """Upwards in the world: by cameras that turn, else what they take for it, made perpendicular to their path, which
+    """Upwards in the world: by cameras that turn, else what they take for it; made perpendicular to their path, which
     is about level."""
     up, centers = camera_to_worlds[:, :, 1].mean(0), camera_to_worlds[:, :, 3]
     up /= max(float(np.linalg.norm(up)), 1e-12)
     level = level_up(camera_to_worlds[:, :, 0], up)
-    if level is not None:
-        return level
+    up = up if level is None else level
     along = np.linalg.svd(centers - centers.mean(0))[2][0]
     slope = float(up @ along)
     up = up - slope * along if abs(slope) < SLOPE else up

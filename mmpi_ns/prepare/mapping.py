@@ -261,7 +261,7 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
     """Runs the global mapper, then the incremental one from the focal length that fits, and chooses by the evidence.
 
     The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse; where the
-    images hardly determine the focal length, all models have that of EXIF.
+    images hardly determine the focal length, let alone more of the lens, all models have that of EXIF instead.
 
     Returns it, the mappers in words, and how far it can be believed. Raises InputError if neither mapper makes a model.
     """
@@ -270,9 +270,10 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
         model = copy.deepcopy(chosen.model)
         model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
         advance()
-    model = polish(model, task.free, task.threads)
     noted = noted_focals(task.database) if task.free.lens else {}
-    if is_focal_open(model, noted, task.threads):
+    if not is_focal_open(model, noted, task.threads):
+        model = polish(model, task.free, task.threads)
+    else:
         model, *rest = (with_focals(m, noted, task.threads) for m in (model, *(w.model for w in others)))
         others = [witness_of(w.name, w.says, m, task.database, task.offered) for w, m in zip(others, rest, strict=True)]
     polished = witness_of(chosen.name, chosen.says, model, task.database, task.offered)
