@@ -53,12 +53,14 @@ EDGE = 0.4
 SECONDS = 0.5
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
-"""Share of an image that must be masked in one of them, or nothing is."""
+"""Share of an image that must be masked in one of them, or nothing is but people,"""
+WALKERS = 3
+"""if they are found in so many images: the detector takes a thing for a person in one or two."""
 COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 12
+VERSION = 13
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -86,8 +88,9 @@ def find_moving(
 
     def shot_of(i: int, view: View, depth: Depth) -> Shot:
         color = cv2.GaussianBlur(straightened_color(images, i, view), (0, 0), 1.0)
-        ground = ground_of(view, depth, up)
-        return Shot(view, np.asarray(color, np.uint8), depth, ground, None if ground is None else horizon_of(view, up))
+        ground, level = ground_of(view, depth, up), horizon_of(view, up)
+        horizon = None if ground is None else level
+        return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon, level=level)
 
     keys = key_images(images, points_of, COMPARED)
     shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS, keys))
@@ -111,9 +114,10 @@ def find_moving(
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
-    # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
+    # Whatever moves comes close at some time; what is found where nothing moves is mostly small. Walkers may stay away.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
-        masks = [np.zeros_like(mask) for mask in masks]
+        walkers = {i: knowledge.walkers for i, knowledge in first.items() if knowledge.walkers.any()}
+        masks = [walkers[i] if i in walkers and len(walkers) >= WALKERS else nothing[i] for i in range(len(masks))]
     return [shot.view for shot in shots], masks, doubt_of(shots, up, masks)
 
 
@@ -259,6 +263,8 @@ class _First:
     swept: Sweep
     levels: NDArray[np.int16]
     """Of ``seeds``. [h, w]"""
+    walkers: Mask
+    """People alone. [h, w]"""
 
 
 def _moves(
@@ -268,9 +274,13 @@ def _moves(
     shot = shots[i]
     gains = first.gains if first else [gain_of(shot, shots[j]) for j in near]
     others = [Neighbour.of(shot, shots[j], gain) for j, gain in zip(near, gains, strict=True)]
+    is_first = first is None
     if first is None:
-        first = _First(gains, sweep(shot, others), np.full(shot.view.gray.shape, UNASKED, np.int16))
+        nobody = np.zeros(shot.view.gray.shape, bool)
+        first = _First(gains, sweep(shot, others), np.full(nobody.shape, UNASKED, np.int16), nobody)
     shown = evidence(shot, others, [masks[j] for j in near], first.swept.impossible)
+    if is_first and len(shot.people):
+        first = replace(first, walkers=grown(shot, shown, first.walkers))
     static = is_static(shot, shown)
     core = first.swept.certain & ~static
     if len(others) >= 2:

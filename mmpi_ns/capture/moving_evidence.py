@@ -63,6 +63,8 @@ class Shot:
     """Row of the horizon in each column, where a ground is found. [w]"""
     people: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 4), int))
     """Left, top, right and bottom of what looks like a person. [n, 4]"""
+    level: NDArray[np.float64] | None = None
+    """The horizon also where no ground is found; None where the camera looks steeply up or down. [w]"""
 
     @cached_property
     def around(self) -> Map:

@@ -58,6 +58,9 @@ CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
 STATIC = 0.5
 """Share of static pixels from which what looks like a person is none."""
+STANDS = 0.1
+"""Share of an object that lies below the height of the camera, at least: what moves stands on the ground, and branches,
+chimneys and towers in front of the sky look like movers where few images show them from far apart."""
 ITERATIONS, LARGE = 3, 4000
 """Of GrabCut, and pixels from which on it is done at half the size."""
 FOLLOWED = 0.7
@@ -131,7 +134,9 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
         if len(rows) < LEAST_PIXELS or min(np.ptp(rows), np.ptp(columns)) < LEAST_SIDE:
             continue
         room, body = room_of(shot, evidence.judged, part)
-        result |= _object(shot, part, evidence.judged, static, room, body)
+        whole = _object(shot, part, evidence.judged, static, room, body)
+        if shot.level is None or (whole & (np.arange(len(part))[:, None] > shot.level)).sum() > STANDS * whole.sum():
+            result |= whole
     for left, top, right, bottom in shot.people:
         # What a person surely covers: the third in the middle.
         body, third = np.zeros_like(core), (right - left) // 3

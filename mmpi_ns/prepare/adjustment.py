@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from mmpi_ns.capture.people import level_up
 from mmpi_ns.capture.sfm import MIN_ANGLE, quiet, triangulate_points, verified_matches
 from mmpi_ns.utils.errors import InputError, progress, say
 
@@ -21,6 +22,9 @@ STILL = 1e-6
 that took four times as long, and moved the focal length by 0.002 px."""
 WORTH = 0.97
 """Fraction of the reprojection error to which a freed parameter must lower it."""
+SQUARE = 0.1
+"""Difference of the two focal lengths from which a lens is not believed: cameras have square pixels, and few images let
+the second focal length absorb other errors. A straight path hardly determines the ratio: a few percent do no harm."""
 LARGEST_ERROR = 4.0
 """Reprojection error in pixels above which an observation is dropped."""
 ENOUGH_POINTS = 300
@@ -38,8 +42,6 @@ BENT_PX = 0.8
 """Mean reprojection error above which another attempt is made even though the images are registered."""
 ROTATION_WEIGHT = 1.0
 """Weight of rotations in the alignment of two tracks; the main direction of the centres has weight 1."""
-LEVEL_TURN = 0.15
-"""Minimum spread of the cameras' right vectors across their main direction for estimating gravity."""
 LEAST_GROUND, GROUND_SHARE, TRIALS = 50, 0.15, 2000
 """Minimum number of points below the cameras for fitting the ground, the fraction that must lie on it, planes tried."""
 GROUND_TILT = 25.0
@@ -59,13 +61,18 @@ class Free:
 
 
 def adjust(
-    model: pycolmap.Reconstruction, threads: int, lens: bool, principal_point: bool = False, poses: bool = True
+    model: pycolmap.Reconstruction,
+    threads: int,
+    lens: bool,
+    principal_point: bool = False,
+    poses: bool = True,
+    focal: bool = True,
 ) -> None:
     """Bundle adjustment of points, and of what is named, over all images with a robust loss, in place; ``lens`` is
-    focal length and distortion."""
+    distortion and, if ``focal``, focal length."""
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
     options.refine_rig_from_world = poses
-    options.refine_focal_length = options.refine_extra_params = lens
+    options.refine_focal_length, options.refine_extra_params = lens and focal, lens
     options.refine_principal_point = principal_point
     options.print_summary = False
     options.ceres.solver_options.num_threads = threads
@@ -116,8 +123,12 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
             points = [[(p.error, p.track.length()) for p in m.points3D.values()] for m in (light, trial)]
             columns = (np.array(rows, np.float64).reshape(-1, 2).T for rows in points)
             before, after = (float(np.sqrt((e**2 * n).sum() / max(n.sum(), 1))) for e, n in columns)
-            is_better = after < WORTH * before
-            say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {'kept' if is_better else 'not kept'}.")
+            stretch = max(abs(c.focal_length_x / c.focal_length_y - 1) for c in trial.cameras.values())
+            is_better, fate = after < WORTH * before, "not kept"
+            if is_better and stretch >= SQUARE:
+                is_better, fate = False, f"not kept, as pixels would be {stretch:.0%} off square"
+            fate = "kept" if is_better else fate
+            say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {fate}.")
             if is_better:
                 light, center, four_terms = trial, center or not is_lens, four_terms or is_lens
     return adjusted(model, four_terms, center) if center or four_terms else model
@@ -321,10 +332,9 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
     centers = poses[:, :3, 3]
     up, words = -poses[:, :3, 1].mean(0), "mean of the cameras, assumed level"
     up /= max(float(np.linalg.norm(up)), 1e-12)
-    values, vectors = np.linalg.eigh(poses[:, :3, 0].T @ poses[:, :3, 0] / len(poses))
-    level = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
-    if values[1] > LEVEL_TURN and values[0] < 0.1 * values[1] and level @ up > 0.5:
-        up = level
+    level = level_up(poses[:, :3, 0], up)
+    if level is not None:
+        up, words = level, "perpendicular to the right vectors of the cameras, which are assumed level"
     if camera_height is not None:
         points = np.array([p.xyz for p in model.points3D.values()])
         up, height = fit_ground(points, centers, up)

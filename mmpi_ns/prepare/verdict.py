@@ -171,8 +171,9 @@ def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool
     worst = [difference.images[int(i)] for i in np.argsort(-difference.centers)[:3]]
     says = (
         f"The {chosen.name} and the {other.name} mapper differ by {difference.centers.mean():.1%} of the track "
-        f"({difference.centers.max():.1%} at most; most at {', '.join(worst)}), with focal lengths of "
-        f"{chosen.focal:.2f} and {other.focal:.2f} image sides."
+        f"({difference.centers.max():.1%} at most; most at {', '.join(worst)}) and by {difference.turns.mean():.1f} "
+        f"degrees ({difference.turns.max():.1f} at most), with focal lengths of {chosen.focal:.2f} and "
+        f"{other.focal:.2f} image sides."
     )
     return Verdict("doubtful", f"{alone.says} {says}".strip())
 

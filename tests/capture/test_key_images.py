@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatc
         if first is None:
             looked_at.append(i)
             assert not any(mask.any() for mask in masks) and set(near) <= set(range(0, 49, 2))
-        return np.full((50, 100), something_moves and i in shows), "knowledge"
+        return np.full((50, 100), something_moves and i in shows), SimpleNamespace(walkers=np.zeros(1, bool))
 
     monkeypatch.setattr(moving, "find_depths", depths)
     monkeypatch.setattr(moving, "_moves", moves)

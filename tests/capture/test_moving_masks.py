@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from training_runs import datamanager
 from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving import find_moving, gain_of, in_image
+from mmpi_ns.capture.moving import WALKERS, find_moving, gain_of, in_image
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import (
     LEAST_LEVELS,
@@ -61,8 +62,8 @@ def test_most_of_the_cars_is_masked_and_little_else(drive, manager):
     assert np.concatenate(static).mean() < 0.02
 
 
-@pytest.mark.parametrize("large", [False, True])
-def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, large):
+@pytest.mark.parametrize(("large", "walkers"), [(False, 0), (True, 0), (False, WALKERS - 1), (False, WALKERS)])
+def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_in_several(monkeypatch, large, walkers):
     view = View(np.zeros((20, 50), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((20, 50), bool))
     nothing = Depth(*np.zeros((2, 20, 50), np.float32))
     shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), nothing, None) for _ in range(3)]
@@ -70,7 +71,9 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     def moves(shots, near, i, masks, uprights, first):
         mask = np.zeros((20, 50), bool)
         mask.flat[: (16 if large else 14) if i == 1 else 3] = True
-        return mask, None
+        person = np.zeros((20, 50), bool)
+        person[0, :2] = i < walkers
+        return mask, SimpleNamespace(walkers=person)
 
     monkeypatch.setattr(moving, "find_depths", lambda *_: iter(shots))
     monkeypatch.setattr(moving, "_moves", moves)
@@ -79,7 +82,7 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     poses[:, 0, 3] = range(3)
     images = PosedImages((Path("x"),) * 3, poses, np.ones((3, 4)), np.tile([50.0, 20], (3, 1)), np.zeros((3, 4)))
     _, masks, _ = find_moving(images, lambda i: np.zeros((0, 3)))
-    assert [int(mask.sum()) for mask in masks] == ([3, 16, 3] if large else [0, 0, 0])
+    assert [int(mask.sum()) for mask in masks] == ([3, 16, 3] if large else [2 * (walkers == WALKERS)] * 3)
 
 
 def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed_or_a_person(monkeypatch):
@@ -332,6 +335,18 @@ def test_an_object_that_seeds_hardly_cover_is_none(apart, kept):
     core = np.zeros(SIZE, bool)
     core[4:57:apart, 20:30] = True
     assert grown(*a_scene(np.full((*SIZE, 3), 200, np.uint8)), core).any() == kept
+
+
+@pytest.mark.parametrize(("row", "moves"), [(20, True), (40, False), (None, True)])
+def test_what_hangs_above_the_height_of_the_camera_is_none(row, moves):
+    """A branch before the sky, or a car; nothing is left out by it where the camera looks steeply down."""
+    core = np.zeros(SIZE, bool)
+    core[15:38, 20:40] = True
+    color = np.full((*SIZE, 3), 60, np.uint8)
+    color[core] = 200
+    shot, shown = a_scene(color)
+    level = None if row is None else np.full(SIZE[1], float(row))
+    assert grown(replace(shot, level=level), shown, core).any() == moves
 
 
 @pytest.mark.parametrize("silent", [True, False], ids=["nothing is said", "all is judged"])

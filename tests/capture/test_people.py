@@ -69,6 +69,16 @@ def test_cameras_that_all_look_down_on_a_level_path_do_not_tilt_the_world(direct
     assert np.degrees(np.arccos(min(1, upright(poses) @ UP))) == pytest.approx(tilt, abs=1e-4)
 
 
+def test_cameras_that_turn_tell_what_is_up_though_all_look_up():
+    poses = np.zeros((11, 3, 4))
+    for pose, angle in zip(poses, np.linspace(0, 1.2, 11), strict=True):
+        right = np.array([np.cos(angle), 0, np.sin(angle)])
+        ahead = np.array([np.sin(angle), 0.15, -np.cos(angle)]) / np.sqrt(1 + 0.15**2)
+        pose[:, :3] = np.stack([right, np.cross(right, ahead), -ahead], -1)
+        pose[:, 3] = 5 * right
+    assert upright(poses) == pytest.approx(UP, abs=1e-9)
+
+
 def test_a_figure_on_the_ground_is_a_person(tmp_path):
     boxes = found(tmp_path, figure(COLUMN, FEET))
     assert len(boxes) == 1

@@ -82,6 +82,16 @@ def test_up_is_found_by_cameras_that_look_down_on_a_turn():
     assert choose_frame(model_of(straight), None)[0].rotation.matrix()[2] == pytest.approx([0, 0, 1], abs=1e-9)
 
 
+def test_up_is_found_by_few_turns_if_cameras_are_hardly_rolled():
+    """A bend of 70 degrees, filmed from below: the mean of the cameras' up leans back, their right vectors do not."""
+    poses = np.tile(np.eye(4), (11, 1, 1))
+    for pose, angle in zip(poses, np.linspace(0, 1.2, 11), strict=True):
+        right = np.array([np.cos(angle), -np.sin(angle), 0])
+        forward = np.array([np.sin(angle), np.cos(angle), 0.15]) / np.sqrt(1 + 0.15**2)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
+    assert choose_frame(model_of(poses), None)[0].rotation.matrix()[2] == pytest.approx([0, 0, 1], abs=1e-9)
+
+
 def test_a_straight_track_is_fitted_without_a_turn_about_itself():
     straight = corridor.poses(6, bend=0.0)
     straight[:, 0, 3] = 0
@@ -266,8 +276,9 @@ def test_given_intrinsics_are_left_alone_and_others_refined():
 
 
 @pytest.mark.parametrize(("tangential", "kept"), [(0.0, "SIMPLE_RADIAL"), (0.02, "OPENCV")])
-def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential, kept):
-    """Exact points seen through a known lens with noise of a third of a pixel, in a model with one radial term."""
+def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential, kept, monkeypatch, capsys):
+    """Exact points seen through a known lens with noise of a third of a pixel, in a model with one radial term; lenses
+    whose pixels are not square are not believed."""
     random, true = np.random.default_rng(0), [300, 300, 100, 80, 0.1, 0.0, tangential, -tangential]
     lens = pycolmap.Camera(model="OPENCV", params=true, **SIZE)
     poses = corridor.poses(6, bend=0.15)
@@ -293,3 +304,8 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
         assert camera.params[6:] == pytest.approx(true[6:], abs=0.004)
         simple = polish(model, Free(lens=True, full_lens=False, principal_point=False), 1)
         assert [c.model.name for c in simple.cameras.values()] == ["SIMPLE_RADIAL"]
+        assert "off square" not in capsys.readouterr().out
+        monkeypatch.setattr("mmpi_ns.prepare.adjustment.SQUARE", 1e-4)
+        square = polish(model, Free(lens=True, full_lens=True, principal_point=False), 1)
+        assert [c.model.name for c in square.cameras.values()] == ["SIMPLE_RADIAL"]
+        assert "not kept, as pixels would be" in capsys.readouterr().out

@@ -1,0 +1,65 @@
+"""EXIF's focal length where the images hardly determine one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from test_prepare_parts import model_of
+
+from mmpi_ns.prepare.noted_focal import is_focal_open, noted_focals, with_focals
+
+TRUE, LENS = 300.0, {"model": "SIMPLE_RADIAL", "width": 200, "height": 160, "camera_id": 1}
+
+
+def a_flight(tilt, focal):
+    """A model, with a focal length that may be wrong, of nine images taken from one height, each turned back towards
+    the middle by so much; keypoints have noise of half a pixel."""
+    random, poses = np.random.default_rng(0), np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :2, 3] = 1.5 * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 2)
+    for pose in poses:
+        ahead = np.array([*(-tilt * pose[:2, 3]), 1.0]) / np.hypot(1, tilt * np.linalg.norm(pose[:2, 3]))
+        down = np.cross(ahead, [1.0, 0.0, 0.0])
+        down /= np.linalg.norm(down)
+        pose[:3, :3] = np.stack([np.cross(down, ahead), down, ahead], -1)
+    points = np.column_stack([random.uniform(-4, 4, (600, 2)), random.uniform(8, 10, 600)])
+    lens = pycolmap.Camera(params=[TRUE, 100, 80, 0.0], **LENS)
+    model = model_of(poses, pycolmap.Camera(params=[focal, 100, 80, 0.0], **LENS))
+    tracks = [pycolmap.Track() for _ in points]
+    for i, image in sorted(model.images.items()):
+        local = (points - poses[i - 1, :3, 3]) @ poses[i - 1, :3, :3]
+        pixels = np.asarray(lens.img_from_cam(local)) + random.normal(0, 0.5, (600, 2))
+        seen = np.flatnonzero(((pixels > 0) & (pixels < [200, 160])).all(-1))
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[seen]])
+        for slot, p in enumerate(seen):
+            tracks[p].add_element(i, slot)
+    for point, track in zip(points, tracks, strict=True):
+        if track.length() > 2:
+            model.add_point3D(point * [1, 1, focal / TRUE], track, np.zeros(3, np.uint8))
+    return model
+
+
+@pytest.mark.parametrize(
+    ("tilt", "focal", "noted", "is_open"), [(0.0, 1.3 * TRUE, TRUE, True), (0.1, TRUE, 1.3 * TRUE, False)]
+)
+def test_only_cameras_that_all_look_the_same_way_leave_the_focal_length_open(tilt, focal, noted, is_open, capsys):
+    model = a_flight(tilt, focal)
+    assert is_focal_open(model, {1: noted}, 1) == is_open
+    assert ("hardly determine" in capsys.readouterr().out) == is_open
+    held = with_focals(model, {1: noted}, 1)
+    assert held.cameras[1].mean_focal_length() == noted and model.cameras[1].mean_focal_length() == focal
+
+
+def test_a_focal_length_near_that_of_exif_is_not_asked_for(capsys):
+    model = a_flight(0.0, 1.05 * TRUE)
+    assert not is_focal_open(model, {1: TRUE}, 1) and not is_focal_open(model, {}, 1)
+    assert "EXIF" not in capsys.readouterr().out
+
+
+def test_only_focal_lengths_of_exif_are_noted(tmp_path):
+    with pycolmap.Database.open(tmp_path / "features.db") as database:
+        for known in (True, False):
+            camera = pycolmap.Camera(params=[TRUE, 100, 80, 0.0], **LENS)
+            camera.has_prior_focal_length = known
+            database.write_camera(camera)
+    assert noted_focals(tmp_path / "features.db") == {1: TRUE}
