@@ -54,8 +54,8 @@ SECONDS = 0.5
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is but people,"""
-WALKERS = 3
-"""if they are found in so many images: the detector takes a thing for a person in one or two."""
+WALKERS = 4
+"""if they are found in so many images: in a few the detector may take a thing for a person."""
 COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
