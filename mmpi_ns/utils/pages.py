@@ -17,7 +17,7 @@ PART = 1 << 20
 def lazy_zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Zeros that take no memory on a CPU until they are written to (torch's are written at once)."""
     count = math.prod(shape)
-    if device.type != "cpu" or sys.platform != "linux" or not count:
+    if device.type != "cpu" or sys.platform == "win32" or not count:
         return torch.zeros(shape, dtype=dtype, device=device)
     # Memory of malloc would be zeroed by hand where it was used before.
     memory = mmap.mmap(-1, count * dtype.itemsize, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
