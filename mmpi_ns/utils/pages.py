@@ -10,6 +10,8 @@ import sys
 import torch
 from torch import Tensor
 
+FORGET, LARGE_PAGES = 4, 14
+"""Of madvise, in linux/mman.h: MADV_DONTNEED, MADV_HUGEPAGE."""
 PART = 1 << 20
 """Numbers that are looked at together."""
 
@@ -28,15 +30,13 @@ def empty_table(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
     """An array that is not written yet, in large pages if the system has any: rows that are read at random then need
     fewer of the processor's page tables."""
     table = torch.empty(shape, dtype=dtype, device=device)
-    if sys.platform == "linux":
-        _advise(table, mmap.MADV_HUGEPAGE)
+    _advise(table, LARGE_PAGES)
     return table
 
 
 def forget(array: Tensor) -> None:
     """Gives back the memory of a contiguous array, or of a part of one, that is not read again; its values are lost."""
-    if sys.platform == "linux":
-        _advise(array, mmap.MADV_DONTNEED)
+    _advise(array, FORGET)
 
 
 def all_zero(array: Tensor) -> bool:
@@ -46,8 +46,8 @@ def all_zero(array: Tensor) -> bool:
 
 
 def _advise(array: Tensor, advice: int) -> None:
-    """madvise for the whole pages of a contiguous array on a CPU. What the kernel does not follow changes nothing."""
-    if array.device.type != "cpu":
+    """madvise for the whole pages of a contiguous array on a CPU. What a system does not follow changes nothing."""
+    if array.device.type != "cpu" or sys.platform != "linux":
         return
     start, page = array.data_ptr(), mmap.PAGESIZE
     first, end = -(-start // page) * page, (start + array.numel() * array.element_size()) // page * page
