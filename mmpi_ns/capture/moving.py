@@ -30,8 +30,9 @@ from mmpi_ns.capture.moving_follow import upright_objects
 from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
 from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
-from mmpi_ns.capture.people import has_detector, horizon_of, people_in, upright
+from mmpi_ns.capture.people import has_detector, horizon_of, people_in
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
+from mmpi_ns.capture.upright import upright
 from mmpi_ns.capture.views import Parallax, View, look_up, project, straightened, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views

@@ -12,8 +12,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.people import level_up
 from mmpi_ns.capture.sfm import MIN_ANGLE, quiet, triangulate_points, verified_matches
+from mmpi_ns.capture.upright import level_up
 from mmpi_ns.utils.errors import InputError, progress, say
 
 Array = NDArray[np.float64]

@@ -66,7 +66,7 @@ def test_most_of_the_cars_is_masked_and_little_else(drive, manager):
 def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_in_several(monkeypatch, large, walkers):
     view = View(np.zeros((20, 50), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((20, 50), bool))
     nothing = Depth(*np.zeros((2, 20, 50), np.float32))
-    shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), nothing, None) for _ in range(3)]
+    shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), nothing, None) for _ in range(5)]
 
     def moves(shots, near, i, masks, uprights, first):
         mask = np.zeros((20, 50), bool)
@@ -78,11 +78,12 @@ def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_i
     monkeypatch.setattr(moving, "find_depths", lambda *_: iter(shots))
     monkeypatch.setattr(moving, "_moves", moves)
     monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
-    poses = np.tile(np.eye(4)[:3], (3, 1, 1))
-    poses[:, 0, 3] = range(3)
-    images = PosedImages((Path("x"),) * 3, poses, np.ones((3, 4)), np.tile([50.0, 20], (3, 1)), np.zeros((3, 4)))
+    poses = np.tile(np.eye(4)[:3], (5, 1, 1))
+    poses[:, 0, 3] = range(5)
+    images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile([50.0, 20], (5, 1)), np.zeros((5, 4)))
     _, masks, _ = find_moving(images, lambda i: np.zeros((0, 3)))
-    assert [int(mask.sum()) for mask in masks] == ([3, 16, 3] if large else [2 * (walkers == WALKERS)] * 3)
+    people = [2 * (i < walkers == WALKERS) for i in range(5)]
+    assert [int(mask.sum()) for mask in masks] == ([3, 16, 3, 3, 3] if large else people)
 
 
 def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed_or_a_person(monkeypatch):

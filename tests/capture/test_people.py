@@ -10,8 +10,9 @@ from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving_evidence import Evidence, Shot
 from mmpi_ns.capture.moving_objects import grown
-from mmpi_ns.capture.people import horizon_of, people_in, upright
+from mmpi_ns.capture.people import horizon_of, people_in
 from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.upright import upright
 from mmpi_ns.capture.views import load_view, straightened_color
 
 WIDTH, HEIGHT, TALL = 640, 480, 120

@@ -1,7 +1,8 @@
 """Parts of mmpi-prepare by themselves: pairs, the scene's frame, lenses, and what the files hold."""
 
-from __future__ import annotations
+from __future__ import subprocess
 
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -309,3 +310,9 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
         square = polish(model, Free(lens=True, full_lens=True, principal_point=False), 1)
         assert [c.model.name for c in square.cameras.values()] == ["SIMPLE_RADIAL"]
         assert "not kept, as pixels would be" in capsys.readouterr().out
+
+
+def test_nothing_of_prepare_waits_for_torch_before_what_moves_is_looked_for():
+    """Importing torch takes seconds and half a gigabyte."""
+    code = "import sys, mmpi_ns.prepare.pipeline; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
