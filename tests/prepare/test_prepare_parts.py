@@ -1,7 +1,8 @@
 """Parts of mmpi-prepare by themselves: pairs, the scene's frame, lenses, and what the files hold."""
 
-from __future__ import subprocess
+from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
