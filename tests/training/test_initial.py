@@ -187,3 +187,13 @@ def test_a_run_starts_from_the_depths_of_its_pixels_once(scene, plan_file, tmp_p
 def test_without_known_depths_every_plane_starts_alike(scene, plan_file, tmp_path):
     field = prepared(scene, plan_file, tmp_path, [0], dense_depth=False, depth_images=False, sfm_path="none")
     assert not field.density.data[BRICK:].any() and not field.features.data.any()
+
+
+def test_a_long_run_draws_half_of_its_rays_until_texels_have_grown(scene, plan_file, tmp_path):
+    trainer = ready(trainer_config(scene, plan_file, tmp_path, 3_000))
+    drawn = {}
+    for step in (0, 374, 375, 2_999):  # of the first 1,500, texels double after an eighth and a quarter
+        for callback in trainer.callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        drawn[step] = len(trainer.pipeline.datamanager.next_train(step)[1]["indices"])
+    assert drawn == {0: 32, 374: 32, 375: 64, 2_999: 64}
