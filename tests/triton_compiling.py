@@ -126,7 +126,6 @@ def all_launches(setattr, shapes=SMALL):
         shapes: of the trials.
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
-    march = importlib.import_module("mmpi_ns.ops.march.gpu")
     setattr(dispatch, "interpreting", True)
     setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.operations()]))
     with launches_noted({}) as noted:
@@ -134,23 +133,20 @@ def all_launches(setattr, shapes=SMALL):
             module = importlib.import_module(f"{dispatch.operations()[name].__module__}.gpu")
             if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
                 setattr(module, "block_size", lambda wanted, device: wanted)
-            for many in (1 << 30, 1) if name in ("march", "show_rays") else (1,):  # blocks for few rays, and for many
-                setattr(march, "MANY", many)
-                for given in cases("cpu", shapes):
-                    trial._outcome(name, "gpu", given)
+            for given in cases("cpu", shapes):
+                trial._outcome(name, "gpu", given)
     return list(noted)
 
 
 def largest_launches(launches):
-    """Of each kernel the launch with the most in it; the march's two, for few rays and for many, by their name."""
+    """Of each kernel the launch with the most in it."""
     largest = {}
     for launch in launches:
         constants = dict(launch.constants)
-        name = f"{launch.name}, {constants['RAYS']} rays" if launch.name == "march_kernel" else launch.name
         # What keeps all samples passes over no empty tiles.
         size = sum(int(value) for value in constants.values()) - 2 * constants.get("KEEP_ALL", False)
-        if name not in largest or size > largest[name][0]:
-            largest[name] = size, launch
+        if launch.name not in largest or size > largest[launch.name][0]:
+            largest[launch.name] = size, launch
     return {name: launch for name, (_, launch) in largest.items()}
 
 
@@ -227,7 +223,7 @@ def write_table(path, architectures):
             rows[name] = {f"sm_{a}": measured(launch, a) for a in architectures}
             print(number, name, rows[name], flush=True)
     spilling = sum(cell["spills"] for rows in plans.values() for row in rows.values() for cell in row.values())
-    headline = {"kernels": len({name.split(",")[0] for name in plans["4"]}), "spilling": spilling}
+    headline = {"kernels": len(plans["4"]), "spilling": spilling}
     content = {"headline": headline, "made": made, "plans": plans}
     path.write_text(json.dumps(content, indent=1), encoding="utf-8")
     path.with_suffix(".md").write_text(page(content), encoding="utf-8")
@@ -245,7 +241,7 @@ def page(content):
         "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
         "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "
         "read or written once; what kernels look up in tables comes on top. The roof is the memory's bandwidth over "
-        "these bytes. The march takes fewer rays a program where there are few, or many heads.",
+        "these bytes. The march takes fewer rays a program where there are many heads.",
     ]  # fmt: skip
     for number, rows in content["plans"].items():
         title = f"## {number} MPIs" if number == "4" else f"## {number} MPIs, where that changes a kernel"

@@ -27,12 +27,7 @@ from mmpi_ns.utils.parallel import in_order
 
 CLOSE = 1e-3
 """Largest difference relative to the largest number: a wrong kernel is off by more, another order of sums by less."""
-FEW = 1e-3
-"""Share of numbers that may differ: two samples at nearly one distance, or half of a ray's mass at nearly one sample,
-come out either way. Of forty rays none may."""
 RAYS, ROWS = 40, 300
-MANY_RAYS = 1 << 14
-"""From so many on the march takes larger blocks."""
 DRIVER = Path("/proc/driver/nvidia/version")
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -57,8 +52,8 @@ def run(name: str, device: str, shapes: Shapes = SMALL) -> None:
             close = max(CLOSE, torch.finfo(b.dtype).eps if b.is_floating_point() else 0.0)
             a, b = a.double(), b.double()
             off = ~((a - b).abs() <= close * b.abs().max().clamp(min=1e-6)) if b.numel() else b
-            if off.numel() and (share := float(off.double().mean())) > FEW:
-                raise Disagreement(f"{share:.2g} of its numbers are not those of plain torch")
+            if off.any():
+                raise Disagreement(f"{float(off.double().mean()):.2g} of its numbers are not those of plain torch")
 
 
 def record(name: str, shapes: Shapes) -> Path:
@@ -118,30 +113,26 @@ def _scene(device: str, with_cube: bool, count: int = 2) -> tuple[SceneLayout, T
     return layout, Tables(_random(device, rows, 1) - 0.5, _random(device, rows, 1), touched)
 
 
-def _rays(device: str, count: int = RAYS) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _rays(device: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Origins, directions, nears and fars."""
-    origins = _random(device, count, 3) * 0.4 - 0.2
-    directions = torch.cat([_random(device, count, 2) - 0.5, torch.ones(count, 1, device=device)], -1)
-    near = torch.full((count, 1), 0.05, device=device)
+    origins = _random(device, RAYS, 3) * 0.4 - 0.2
+    directions = torch.cat([_random(device, RAYS, 2) - 0.5, torch.ones(RAYS, 1, device=device)], -1)
+    near = torch.full((RAYS, 1), 0.05, device=device)
     return origins, torch.nn.functional.normalize(directions, dim=-1), near, torch.full_like(near, torch.inf)
 
 
-def _marches(device: str, shapes: Shapes, many: bool | None = None) -> list[tuple]:
-    """Also of many rays where the kernels do not take minutes for them, by Triton's interpreter."""
-    counts = (RAYS, MANY_RAYS) if (device == "cuda" if many is None else many) else (RAYS,)
+def _marches(device: str, shapes: Shapes) -> list[tuple]:
     cases = []
     for mpis in shapes.mpis:
-        # Of many rays some sample would weigh what a threshold of use says: they keep all that weighs anything.
-        ways = [(count, MarchOptions(0.02 / max(mpis, 2) if count == RAYS else 1e-30)) for count in counts]
-        ways += [(count, options._replace(blends=True)) for count, options in ways] if shapes.blends else []
+        some, every = MarchOptions(0.02 / max(mpis, 2)), MarchOptions(0.0)
         layout, tables = _scene(device, shapes.cube, mpis)
-        cases += [
-            (layout, tables, Rays(*_rays(device, count)), options)
-            for count, options in [*ways, (RAYS, MarchOptions(0.0))]
-        ]
-        if shapes.blends:  # before that, each MPI answers rays of its own
+        rays = Rays(*_rays(device))
+        cases += [(layout, tables, rays, options) for options in (some, every)]
+        if shapes.blends:
+            cases.append((layout, tables, rays, some._replace(blends=True)))
+            # Before that, each MPI answers rays of its own.
             for which in ((_random(device, RAYS, layout.num_heads) < 0.5, None), (None, _random(device, RAYS, mpis))):
-                cases.append((layout, tables, Rays(*_rays(device), *which), ways[0][1]))
+                cases.append((layout, tables, Rays(*_rays(device), *which), some))
     return cases
 
 
@@ -172,10 +163,10 @@ def _gathers(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
-def _pictures(device: str, shapes: Shapes, many: bool | None = None) -> list[tuple]:
+def _pictures(device: str, shapes: Shapes) -> list[tuple]:
     return [
         (layout, tables, 2 * _random(device, len(tables.density), shapes.channels) - 1, *how)
-        for layout, tables, *how in _marches(device, shapes, many)
+        for layout, tables, *how in _marches(device, shapes)
     ]
 
 

@@ -28,9 +28,8 @@ OPAQUE = tl.constexpr(ends.OPAQUE)
 HALF = tl.constexpr(ends.HALF)
 STEPS = 8
 """Samples that a ray looks up at once."""
-RAYS, FEW_RAYS, MANY = 16, 4, 16_384
-"""Rays of a program (one warp); of one where there are few rays; number of rays from which they are many. A device has
-room for thousands of programs."""
+RAYS = 4
+"""Rays of a program (one warp). Four times as many march no faster, and take minutes to compile."""
 RANGES = 256
 """Rays of a program times their heads, of each of which it holds nine numbers: twice as many do not fit registers."""
 NUMBERS = 256
@@ -232,7 +231,7 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
         numbers=torch.zeros(1 + num_heads, dtype=torch.int32, device=device),
     )
     heads, (head_rows, biases, cube_row) = triton.next_power_of_2(num_heads), layout.constants
-    at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
+    at_once = block_size(max(1, min(RAYS, RANGES // heads)), device)
     launch(
         march_kernel, num_rays, at_once, *parts,
         head_rows, grids_of(layout), biases, cube_row, *dense_fields(tables),
