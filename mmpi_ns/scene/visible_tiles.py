@@ -21,7 +21,9 @@ BORDER_RAYS = 33
 MARGIN = 0.25
 """Texels added on each side of a tile: rays are drawn in float32."""
 AT_ONCE = 8
-"""Cameras that are compared with all tiles of a plane that none of the earlier ones can read."""
+"""Cameras that are compared with all tiles that none of the earlier ones can read."""
+PART = 1 << 14
+"""Tiles that are looked at together."""
 REMEMBERED = 128
 """Plans and cameras whose tiles are remembered, a bit each; the windows of a long capture have a plan each."""
 
@@ -119,15 +121,19 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[
         along.append((slope[..., None, None] * tangents).amax(-2).to(device))
     along_x, along_y = along
     shift, ahead = (normals * origins[:, None]).sum(-1), normals[..., 2]
-    reachable = torch.zeros(mpi.planes, along_y.shape[-1], along_x.shape[-1], dtype=torch.bool, device=device)
-    for plane in range(mpi.planes):
-        w = mpi.last_disparity + (mpi.planes - 1 - plane) * mpi.disparity_step
-        rest = (ahead - w * shift).to(device)
-        first, *others = (w * origins[:, 2] < 1).nonzero()[:, 0].to(device).split(AT_ONCE)
-        most = along_y[first][..., :, None] + (along_x[first] + rest[first][..., None])[..., None, :]
-        reachable[plane] = (most >= 0).all(1).any(0)
-        for some in others:
-            y, x = (~reachable[plane]).nonzero(as_tuple=True)
-            most = along_y[some][..., y] + (along_x[some][..., x] + rest[some][..., None])
-            reachable[plane, y, x] = (most >= 0).all(1).any(0)
+    w = mpi.last_disparity + torch.arange(mpi.planes - 1, -1, -1, dtype=torch.float64) * mpi.disparity_step
+    rest = ahead - w[:, None, None] * shift
+    rest[w[:, None] * origins[:, 2] >= 1] = -torch.inf  # cameras that a plane lies behind
+    rest = rest.to(device)
+    rows, columns = along_y.shape[-1], along_x.shape[-1]
+    reachable = torch.zeros(mpi.planes, rows, columns, dtype=torch.bool, device=device)
+    first, *others = range(0, len(origins), AT_ONCE)
+    for part, marks in zip(*(x.split(max(1, PART // (rows * columns))) for x in (rest, reachable)), strict=True):
+        some = slice(first, first + AT_ONCE)
+        most = along_y[some][..., None] + (along_x[some] + part[:, some, :, None])[..., None, :]
+        marks |= (most >= 0).all(2).any(1)
+        for some in (slice(start, start + AT_ONCE) for start in others):
+            plane, y, x = (~marks).nonzero(as_tuple=True)
+            most = along_y[some][..., y] + (along_x[some][..., x] + part[:, some].movedim(0, -1)[..., plane])
+            marks[plane, y, x] = (most >= 0).all(1).any(0)
     return reachable
