@@ -99,6 +99,17 @@ def test_every_tile_that_a_pixel_reads_is_reachable_and_few_others_are(lens, see
     assert wanted[:mpis].float().mean() < 0.75 and extra < 0.06, (wanted[:mpis].float().mean(), extra)
 
 
+def test_planes_that_every_camera_has_passed_are_out_of_reach():
+    """Even where all they hold lies within the image that a camera would show of what is behind it."""
+    shot, mpi = cameras(0, turn=0.0), make_mpi("passed", (0.0, 0.0, 0.0), rotation([1, 0, 0, 0]), near=0.7, planes=8)
+    shot.camera_to_worlds[:, :, 3] = torch.tensor([0.0, 0.0, 2.0])
+    found = reachable_tiles(TrainingViews.of(shot), ScenePlan((mpi,), None, 0.05, 1.0))
+    steps = torch.arange(mpi.planes - 1, -1, -1)
+    depths = 1 / (mpi.last_disparity + steps * mpi.disparity_step)
+    ahead = found.view(mpi.planes, -1).any(1)
+    assert (depths < 2).any() and torch.equal(ahead, depths > 2)
+
+
 @pytest.mark.parametrize("count", [1, 7, 30])
 def test_tiles_of_all_images_are_those_of_each_alone_and_found_once(monkeypatch, count):
     """Also behind, before and among the planes; on whatever device, and for equal cameras in other arrays."""
