@@ -56,7 +56,7 @@ class ScheduleConfig:
     release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
     """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
     before the texels double."""
-    release_weight: float = 5e-3
+    release_weight: float = 7.5e-3
     """Bricks in which no sample of a training ray has this weight are released; 0 keeps all that rays can reach."""
 
 
