@@ -81,7 +81,7 @@ def changed(x, rows, columns):
 
 def walked():
     """Arguments of the march and of pictures: a layout, tables, features, rays and options."""
-    (layout, tables), rays = trial._scene("cpu", True), trial._rays("cpu", 5)
+    (layout, tables), rays = trial._scene("cpu", True), [x[:5] for x in trial._rays("cpu")]
     heads, priorities = torch.ones(5, 3, dtype=torch.bool), torch.rand(5, 2)
     return layout, tables, torch.zeros(len(tables.density), 4), Rays(*rays, heads, priorities), MarchOptions(0.01)
 
