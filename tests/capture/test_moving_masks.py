@@ -141,27 +141,6 @@ def test_masks_of_some_frames_win_and_what_moves_in_the_others_is_masked(drive, 
         np.testing.assert_array_equal(partly.train_dataset.moving[i], manager.train_dataset.moving[i])
 
 
-def test_masks_made_without_a_detector_of_people_are_made_again_with_one(drive, manager, monkeypatch):
-    """Nothing else changes, so that without a detector in the key the first masks would be taken from the cache."""
-    searches = []
-
-    def search(images, points_of, progress):
-        searches.append(hasattr(cv2, "HOGDescriptor"))
-        views = [View(np.zeros((4, 4), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((4, 4), bool))] * len(images.files)
-        return views, [np.zeros((4, 4), bool)] * len(views), ""
-
-    monkeypatch.setattr(moving, "find_moving", search)
-    monkeypatch.setattr(moving, "VERSION", "of this test")
-    again = [lambda: moving.moving_masks(manager.observations, manager.train_dataset)] * 2
-    with monkeypatch.context() as without:
-        without.delattr(cv2, "HOGDescriptor")
-        for masks in again:
-            masks()
-    for masks in again:
-        masks()
-    assert searches == [False, True]
-
-
 def test_the_plan_shows_what_moves(drive, manager, tmp_path):
     _, moves = load_observations(drive, moving=tmp_path / "report" / "moving.jpg")
     assert moves == manager.moves and re.fullmatch(r".* % of the training pixels, in \d of 8 images, show .*", moves)

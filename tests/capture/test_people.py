@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 
+from mmpi_ns.capture import moving
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving_evidence import Evidence, Shot
@@ -101,6 +104,28 @@ def test_where_opencv_has_no_detector_nobody_is_searched_and_it_is_said(tmp_path
     say_once.cache_clear()
     assert found(tmp_path, figure(COLUMN, FEET)).shape == (0, 4)
     assert f"OpenCV {cv2.__version__} has no detector" in " ".join(capsys.readouterr().out.split())
+
+
+def test_masks_made_without_a_detector_are_made_again_with_one(tmp_path, monkeypatch):
+    """Nothing else changes, so that without a detector in the key the first masks would be taken from the cache."""
+    searches = []
+    images, view = of_a_level_camera(tmp_path, figure(COLUMN, FEET))
+
+    def search(*_, progress):
+        searches.append(hasattr(cv2, "HOGDescriptor"))
+        return [view], [np.zeros(view.gray.shape, bool)], ""
+
+    monkeypatch.setattr(moving, "posed_images", lambda *_: images)
+    monkeypatch.setattr(moving, "find_moving", search)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    seen = SimpleNamespace(sizes=[(WIDTH, HEIGHT)], tracked=(np.zeros(0, int), np.zeros((0, 3))))
+    with monkeypatch.context() as without:
+        without.delattr(cv2, "HOGDescriptor")
+        for _ in range(2):
+            moving.moving_masks(seen, [])
+    for _ in range(2):
+        moving.moving_masks(seen, [])
+    assert searches == [False, True]
 
 
 @pytest.mark.parametrize("is_static", [False, True])
