@@ -171,7 +171,7 @@ def fuse(inverse: Sequence[Map], weight: Sequence[Map]) -> Depth:
 def find_depths(
     images: PosedImages,
     points_of: Callable[[int], NDArray[np.float64]],
-    width: int,
+    side: int,
     finish: Callable[[int, View, Depth], T] = lambda _, view, depth: (view, depth),
     progress: Progress = lambda work, _: work,
     rounds: Sequence[int] | None = None,
@@ -182,14 +182,14 @@ def find_depths(
     Args:
         images: the training images in their originals.
         points_of: SfM points [P, 3] that an image saw.
-        width: working size, pixels.
+        side: longer side of the images at working size, pixels, at most.
         finish: makes an image's result from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
         rounds: of matching; None: by size.
         among: the images that others are compared with; None for all.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        results = in_turn(_tasks(pool, images, points_of, width, finish, rounds, among), num_threads() + 1)
+        results = in_turn(_tasks(pool, images, points_of, side, finish, rounds, among), num_threads() + 1)
         for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()
@@ -201,7 +201,7 @@ def _tasks(
     pool: ThreadPoolExecutor,
     images: PosedImages,
     points_of: Callable[[int], NDArray[np.float64]],
-    width: int,
+    side: int,
     finish: Callable[[int, View, Depth], T],
     rounds: Sequence[int] | None,
     among: Sequence[int] | None,
@@ -230,7 +230,7 @@ def _tasks(
     for i, views in enumerate(near):
         for j in views:
             if j not in shown:
-                shown[j] = pool.submit(load_view, images, j, width)
+                shown[j] = pool.submit(load_view, images, j, side)
         depths[i] = pool.submit(match, i, [shown[j] for j in views])
         yield False, depths[i]
         while first < len(near) and max(near[first]) <= i:

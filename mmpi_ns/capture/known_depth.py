@@ -37,10 +37,11 @@ from mmpi_ns.utils.parallel import in_order, num_threads
 
 Codes = NDArray[np.int16]
 
-VERSION = 15
+VERSION = 16
 """Version of the algorithm: cached depths of another version are recomputed."""
-FINER, WIDEST = 2.0, 1600
-"""Images are matched at this multiple of the training size, and at most this wide, if the originals are available."""
+FINER, LONGEST = 2.0, 1600
+"""Images are matched at this multiple of the training size, if the originals are available, and their longer side has
+at most so many pixels."""
 MOST_WORKING = 2.5e8
 """Total number of pixels at which images are matched (10 bytes each); larger captures are matched at a smaller size."""
 COVERED = 0.3
@@ -160,25 +161,25 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     """Depths by dense matching, from the cache if possible."""
     seen_by, points = observations.tracked
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
-    widest, pixels = max(w for _, w in shapes), sum(w * h for h, w in shapes)
-    width = int(min(WIDEST, widest * min(FINER, (MOST_WORKING / pixels) ** 0.5)))
+    longest, pixels = max(max(shape) for shape in shapes), sum(w * h for h, w in shapes)
+    side = int(min(LONGEST, longest * min(FINER, (MOST_WORKING / pixels) ** 0.5)))
 
     def match() -> Iterable[Codes]:
         threads = num_threads()
-        working = sum(float(min(1, width / w) ** 2 * w * h) for w, h in original.sizes)
+        working = sum(float(min(1, side / max(w, h)) ** 2 * w * h) for w, h in original.sizes)
         seconds = (SECONDS * 1e-6 * working + SEARCH_SECONDS * len(shapes)) / threads
         CONSOLE.print(
-            f"Matching {len(shapes)} images densely, at most {width} pixels wide: about {duration(seconds)} with "
-            f"{threads} thread(s)."
+            f"Matching {len(shapes)} images densely, at most {side} pixels wide or high: about {duration(seconds)} "
+            f"with {threads} thread(s)."
         )
         return find_depths(
-            original, lambda i: points[seen_by == i], width,
+            original, lambda i: points[seen_by == i], side,
             lambda i, view, depth: packed(at_training_pixels(view, depth, posed, i, shapes[i])),
             progress=lambda work, count: track(work, "Depths", count, console=CONSOLE),
         )  # fmt: skip
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    return _from_cache(digest(original.files, "depths", VERSION, width, shapes, *cameras, seen_by, points), match)
+    return _from_cache(digest(original.files, "depths", VERSION, side, shapes, *cameras, seen_by, points), match)
 
 
 def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:

@@ -61,7 +61,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 13
+VERSION = 14
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -84,7 +84,6 @@ def find_moving(
         points_of: SfM points [P, 3] that an image saw.
         progress: wraps the images as they are worked on.
     """
-    width = round(SIDE * float(np.median(np.minimum(1, images.sizes[:, 0] / images.sizes[:, 1]))))
     up = upright(images.camera_to_worlds)
 
     def shot_of(i: int, view: View, depth: Depth) -> Shot:
@@ -94,7 +93,7 @@ def find_moving(
         return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon, level=level)
 
     keys = key_images(images, points_of, COMPARED)
-    shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS, keys))
+    shots = list(find_depths(images, points_of, SIDE, shot_of, progress, ROUNDS, keys))
     near = [neighbours(images, i, keys) for i in range(len(shots))]
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
     nothing, first = masks.copy(), {}

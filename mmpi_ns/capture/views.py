@@ -56,12 +56,12 @@ class View:
         return self._reduced.setdefault(factor, smaller)
 
 
-def load_view(images: PosedImages, i: int, width: int) -> View:
-    """Image i in gray, at most ``width`` pixels wide, its lens distortion taken out."""
+def load_view(images: PosedImages, i: int, side: int) -> View:
+    """Image i in gray, its longer side at most ``side`` pixels, its lens distortion taken out."""
     gray = _read(images.files[i], cv2.IMREAD_GRAYSCALE)
     full_height, full_width = gray.shape
-    if full_width > width:
-        height = max(1, round(full_height * width / full_width))
+    if max(gray.shape) > side:
+        width, height = (max(1, round(n * side / max(gray.shape))) for n in (full_width, full_height))
         gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
     scale = np.array([gray.shape[1] / full_width, gray.shape[0] / full_height])
     pinhole = images.intrinsics[i] * np.tile(scale, 2)
