@@ -17,7 +17,7 @@ def test_the_longer_side_of_a_working_view_is_limited(tmp_path, size):
     cv2.imwrite(str(tmp_path / "photo.png"), np.zeros(size[::-1], np.uint8))
     pinhole = np.array([[800.0, 900.0, 480.0, 260.0]])
     images = PosedImages(
-        (tmp_path / "photo.png",), POSES[:1], pinhole, np.array([size], float), np.zeros((1, 4)), False
+        (tmp_path / "photo.png",), np.stack(POSES[:1]), pinhole, np.array([size], float), np.zeros((1, 4)), False
     )
     view = load_view(images, 0, 200)
     assert view.gray.shape[::-1] == (size[0] // 5, size[1] // 5)
