@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.views import Map, Parallax, View
-from mmpi_ns.ops.patches import (
-    GRAZING,
-    OFFSETS,
-    Patches,
-    compare_planes,
-    others_of,
-    spread_planes,
-)
+from mmpi_ns.ops.patches import GRAZING, OFFSETS, Patches, compare_planes, others_of, spread_planes
 
 PIXELS = 220.0**2
 """Pixels of a view in the search, at most."""

@@ -147,6 +147,8 @@ class Parallax:
     linear: NDArray[np.float64]
     """a at a pixel (x, y) is this times (x, y, 1). [3, 3]"""
     b: NDArray[np.float32]
+    tensors: tuple[Tensor, Tensor]
+    """Both as compiled operations read them."""
 
     @staticmethod
     def between(view: View, neighbour: View) -> Parallax:
@@ -155,12 +157,8 @@ class Parallax:
         shift = axes @ neighbour.pose[:, :3].T @ (view.pose[:, 3] - neighbour.pose[:, 3])
         to_pixels = camera_matrix(neighbour.pinhole)
         linear = to_pixels @ turn @ np.linalg.inv(camera_matrix(view.pinhole))
-        return Parallax(linear, (to_pixels @ shift).astype(np.float32))
-
-    @property
-    def tensors(self) -> tuple[Tensor, Tensor]:
-        """As compiled operations read them."""
-        return torch.from_numpy(self.linear).float(), torch.from_numpy(self.b)
+        b = (to_pixels @ shift).astype(np.float32)
+        return Parallax(linear, b, (torch.from_numpy(linear).float(), torch.from_numpy(b)))
 
     def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
         """Pixels x and y of points at these inverse depths, far outside if behind, and their depths over those here."""
