@@ -25,7 +25,7 @@ from mmpi_ns.capture.sfm import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.adjustment import STILL, Free, is_bent, polish, quality, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.features import matching_pairs
-from mmpi_ns.prepare.noted_focal import is_focal_open, noted_focals, with_focals
+from mmpi_ns.prepare.noted_focal import open_focals, with_focals
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, best_first, judge_alone, judge_together
 from mmpi_ns.utils.errors import InputError, progress, say
 
@@ -270,12 +270,12 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
         model = copy.deepcopy(chosen.model)
         model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
         advance()
-    noted = noted_focals(task.database) if task.free.lens else {}
-    if not is_focal_open(model, noted, task.threads):
-        model = polish(model, task.free, task.threads)
-    else:
+    noted = open_focals(model, task.database, task.threads) if task.free.lens else {}
+    if noted:
         model, *rest = (with_focals(m, noted, task.threads) for m in (model, *(w.model for w in others)))
         others = [witness_of(w.name, w.says, m, task.database, task.offered) for w, m in zip(others, rest, strict=True)]
+    else:
+        model = polish(model, task.free, task.threads)
     polished = witness_of(chosen.name, chosen.says, model, task.database, task.offered)
     before, after = (ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished))
     if after > before:
