@@ -181,13 +181,11 @@ def find_depths(
     """The depths of all images in turn, by all threads; their number does not change the depths.
 
     Args:
-        images: the training images in their originals.
+        images, width: the training images in their originals, and the working size, pixels.
         points_of: SfM points [P, 3] that an image saw.
-        width: working size, pixels.
         finish: makes an image's result from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
-        rounds: of matching; None: by size.
-        among: the images that others are compared with; None for all.
+        rounds, among: of matching, None: by size; the images that others are compared with, None for all.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
         results = in_turn(_tasks(pool, images, points_of, width, finish, rounds, among), num_threads() + 1)

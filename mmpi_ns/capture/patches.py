@@ -77,16 +77,8 @@ class Surfaces:
 
 
 def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces | None:
-    """Planes through the pixels of a view.
-
-    Args:
-        view: what it shows.
-        others: its neighbours.
-        rough: inverse depths to start from, of which the range matters most. [H, W]
-
-    Returns:
-        The planes at a low resolution; None if the view is too small, or nothing is known of its depths.
-    """
+    """Planes through the pixels of a view at a low resolution; None if it is too small, or nothing is known of its
+    depths. ``rough`` are inverse depths to start from, of which the range matters most. [H, W]"""
     height, width = view.gray.shape
     smallest = max(1.0, (height * width / PIXELS) ** 0.5)
     if not others or min(height, width) < LEAST_SIDE * LEVELS[0][0] * smallest or not (rough > 0).any():

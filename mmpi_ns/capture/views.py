@@ -211,13 +211,7 @@ def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
 def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: bool = False) -> NDArray[Any]:
     """Values of an image at pixel places, centres at halves: interpolated, or the nearest pixel's and 0 outside.
 
-    Args:
-        image: [H, W] or [H, W, C], of any size.
-        x, y: places, of any one shape and number.
-        nearest: take the nearest pixel.
-
-    Returns:
-        The shape of ``x``, and channels if the image has several.
+    The image [H, W] or [H, W, C] may have any size, and the places any one shape, which the values have, too.
     """
     at_x, at_y = (np.subtract(c, 0.5, dtype=np.float32) for c in (x, y))
     mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR

@@ -223,13 +223,9 @@ def map_globally(
 ) -> pycolmap.Reconstruction | None:
     """The largest model of the global mapper, None if there is none; read back where it was made before.
 
-    Every random draw is seeded, small angles are kept, and given intrinsics left alone.
-
-    Args:
-        task, threads: what is to be mapped, and CPU threads.
-        name: of the start: its folder gets the models.
-        focals: focal lengths to start from, in pixels by camera id; the others are those of the database.
-        names: the images to place.
+    Every random draw is seeded, small angles are kept, and given intrinsics left alone. ``focals`` are focal lengths to
+    start from, in pixels by camera id (the others are those of the database), ``name`` is that of the start, whose
+    folder gets the models, and ``names`` are the images to place.
     """
     folder, folders, refine = task.work / name, task.work / name / "models", task.free.lens
     if not (folder / "done").exists():
