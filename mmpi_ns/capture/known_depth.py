@@ -67,12 +67,6 @@ class KnownDepth:
     codes: Sequence[Codes]
     """[H, W, 2] each, by ``packed``; mapped from a file or computed when read, so that they take no memory."""
 
-    @staticmethod
-    def nothing(sizes: NDArray[np.float64]) -> KnownDepth:
-        """For images of these sizes (width, height); takes no memory."""
-        unknown = np.int16(UNKNOWN)
-        return KnownDepth(tuple(np.broadcast_to(unknown, (int(h), int(w), 2)) for w, h in sizes))
-
     def image(self, i: int) -> Map:
         """The numbers of one image. [H, W, 2]"""
         return unpacked(torch.from_numpy(np.require(self.codes[i], requirements="W"))).numpy()
@@ -120,7 +114,8 @@ def know_depths(
     """
     if not (dense or sensor or observations.loose is not None):
         return None, observations
-    depths, posed = KnownDepth.nothing(observations.sizes), posed_images(observations, dataset)
+    unknown = (np.broadcast_to(np.int16(UNKNOWN), (int(h), int(w), 2)) for w, h in observations.sizes)  # of no memory
+    depths, posed = KnownDepth(tuple(unknown)), posed_images(observations, dataset)
     files = outputs.metadata.get("depth_filenames") if sensor else None
     if posed is None or not (dense or files or observations.loose is not None):
         return depths, observations

@@ -188,7 +188,7 @@ def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie
     distances = np.linalg.norm(placed.points[placed.seen_point] - placed.centers[placed.seen_by], axis=-1)
     assert len(expected) > 30 and len(placed.seen_at) == 0
     assert np.allclose(np.stack([placed.seen_by, distances], -1), expected, rtol=1e-5)
-    nothing = KnownDepth.nothing(manager.observations.sizes)
+    nothing = KnownDepth([np.full((HEIGHT, WIDTH, 2), UNKNOWN, np.int16)] * len(manager.train_dataset))
     assert known_depth.of_cells(manager.observations, nothing, manager.train_dataset) is manager.observations
 
 
