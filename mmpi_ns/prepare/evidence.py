@@ -107,16 +107,16 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         for image in images
     }
     rays, observations = {}, []  # rays in the camera, with z = 1
-    for place, (image, pose) in enumerate(zip(images, poses, strict=True)):
+    for n, (image, pose) in enumerate(zip(images, poses, strict=True)):
         pixels = np.array([p.xy for p in image.points2D], dtype=np.float64).reshape(-1, 2)
         rays[image.image_id] = np.asarray(model.cameras[image.camera_id].cam_from_img(pixels)).reshape(-1, 2)
         seen = points[image.image_id]
         directions = np.c_[rays[image.image_id], np.ones(len(seen))][seen >= 0] @ pose[:3, :3].T
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         center = np.tile(pose[:3, 3], (len(directions), 1))
-        observations.append((seen[seen >= 0], np.full(len(directions), place), center, directions))
+        observations.append((seen[seen >= 0], np.full(len(directions), n), center, directions))
     points_seen, frames, centers, directions = (np.concatenate(column) for column in zip(*observations, strict=True))
-    place, rows = {image_id: i for i, image_id in enumerate(sorted(points))}, []
+    place, rows = {image.image_id: n for n, image in enumerate(images)}, []  # of pairs of registered images
     for a, b, matches in verified_matches(database):
         if a not in place or b not in place or len(matches) < MIN_INLIERS:
             continue
