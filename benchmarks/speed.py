@@ -98,7 +98,8 @@ def take_turns(request: dict[str, Any], tell: Tell) -> Row:
     leave_lpips_out()
     ours = Steps(request["ours"])
     dense, nerfacto = DenseSteps(ours), Steps(request["nerfacto"])
-    assert nerfacto.rays == ours.rays
+    batch, theirs = (each.pipeline.datamanager.get_train_rays_per_batch() for each in (ours, nerfacto))
+    assert theirs == batch
     nerfacto.run(2)  # its process that prepares batches takes seconds to start
     dense.run(1)
     rounds, found, pixels = range(request["rounds"]), {}, {}
@@ -111,8 +112,8 @@ def take_turns(request: dict[str, Any], tell: Tell) -> Row:
         tell(", ".join(f"{n} {v:.3g}" for n, v in more.items()))
 
     for _ in rounds:
-        add(rays_per_s=steps * ours.rays / ours.run(steps))
-        add(**{f"{name}_rays_per_s": count * ours.rays / peer.run(count) for name, peer, count in peers})
+        add(rays_per_s=steps * batch / ours.run(steps))
+        add(**{f"{name}_rays_per_s": count * batch / peer.run(count) for name, peer, count in peers})
     for _ in rounds:  # frames of the trained model
         frame_s, pixels["frame_pixels"] = ours.render()
         full_s, pixels["frame_full_pixels"] = ours.render(request["full_size"])

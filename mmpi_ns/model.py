@@ -249,14 +249,8 @@ class MMPIModel(Model):
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
     ) -> dict[str, Tensor]:
-        """``image_outputs`` of one window; winning MPIs are counted through all windows.
-
-        Args:
-            window: its number.
-            field: its field.
-            bundle: the rays.
-            chosen: the one (window, head) to show; None for all.
-        """
+        """``image_outputs`` of one window, by its number and field; winning MPIs are counted through all windows.
+        ``chosen``: the one (window, head) to show; None for all."""
         mode, first_head = self.config.rendering.mode, sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"

@@ -11,10 +11,10 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from mmpi_ns.capture.checks import check_transforms
+from mmpi_ns.capture.datamanager import check_there
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.pipeline import summary
-from mmpi_ns.utils.errors import looked_at
 from mmpi_ns.utils.values import Number, check_options
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -54,8 +54,7 @@ class Score:
         """Scores, prints and returns name and metrics of each image, and the means."""
         counts = {name: Number(0, whole=True) for name in ("downscale_factor", "test_images")}
         check_options(self, counts, "--")
-        if not self.data.exists():
-            raise ValueError(f"There is no scene at {looked_at(self.data)}: check the path.")
+        check_there(self.data)
         parser = NerfstudioDataParserConfig(data=self.data, downscale_factor=self.downscale_factor)
         check_transforms(parser, self.data, ("test",), opens=True)
         truths = MMPIDataset(parser.setup().get_dataparser_outputs(split="test"))

@@ -96,11 +96,6 @@ class Steps:
         self.step += count
         return clock() - start
 
-    @property
-    def rays(self) -> int:
-        """Pixel rays of a step."""
-        return self.pipeline.datamanager.get_train_rays_per_batch()
-
     @torch.no_grad()
     def render(self, larger: int = 1, rays: int = 0) -> tuple[float, int]:
         """Renders a test view, or the first so many rays of it; returns seconds and pixels."""

@@ -70,9 +70,8 @@ def held(
     """
     bytes_of_image = bytes_of_pixel * float(sizes.prod(-1).max())
 
-    @lru_cache(max(least, min(HELD, int(HELD_BYTES / bytes_of_image))))
-    def entry(_: int) -> tuple[Lock, list[T]]:
-        return Lock(), []
+    most = max(least, min(HELD, int(HELD_BYTES / bytes_of_image)))
+    entry: Callable[[int], tuple[Lock, list[T]]] = lru_cache(most)(lambda _: (Lock(), []))
 
     def result(i: int) -> T:
         lock, results = entry(i)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -318,19 +318,16 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         sources, batch = self.sources, None
         pixel_rays = max(1, round(self.share_of_rays * self.get_train_rays_per_batch()))
         assert sources is not None
+        draw, seed, device = partial(sources.draw, pixel_rays), self.config.seed, self.device
         if not self.training:
-            g = generator(self.config.seed, self.train_count, "pixels", self.device)
-            return sources.draw(pixel_rays, g, pixels_alone=True)
-
-        def drawn(of: int) -> Batch:
-            return sources.draw(pixel_rays, generator(self.config.seed, of, "pixels", self.device))
-
+            return draw(generator(seed, self.train_count, "pixels", device), pixels_alone=True)
         if self._ahead is not None:
             source, key, future = self._ahead
             batch = future.result() if source is sources and key == (step, pixel_rays) else None
-        batch = batch or drawn(step)
-        if num_threads() > 1 and torch.device(self.device).type == "cpu":
-            self._ahead = sources, (step + 1, pixel_rays), self._thread.submit(drawn, step + 1)
+        batch = batch or draw(generator(seed, step, "pixels", device))
+        if num_threads() > 1 and torch.device(device).type == "cpu":
+            future = self._thread.submit(draw, generator(seed, step + 1, "pixels", device))
+            self._ahead = sources, (step + 1, pixel_rays), future
         return batch
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import cv2
@@ -25,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from mmpi_ns.capture.patches import Surfaces, search_surfaces
+from mmpi_ns.capture.patches import search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
@@ -246,7 +247,14 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     if not others or min(view.gray.shape) < SMALLEST:
         return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
-    flow = _flow_of_movers() if rounds else lambda a, b: find_motion(a, b, STRIDE[is_large], COMPARISONS)
+    flow: Flow = partial(find_motion, stride=STRIDE[is_large], rounds=COMPARISONS)
+    if rounds:  # OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/log/moving.md)
+        search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        search.setFinestScale(0)
+        search.setVariationalRefinementIterations(0)
+        search.setGradientDescentIterations(8)
+        search.setPatchStride(STRIDE[False])
+        flow = partial(search.calc, flow=None)  # type: ignore[arg-type]
     rough, depth = rough_inverse_depth(view.reduced(rounds[0]) if rounds else view, points), None
     surfaces = None if rounds else search_surfaces(view, others, rough)
     if surfaces is not None:
@@ -268,21 +276,9 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
         pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]
         depth = without_fringes(small, fuse(*zip(*pairs, strict=True)))
     assert depth is not None
-    return depth if surfaces is None else filled(depth, surfaces)
-
-
-def _flow_of_movers() -> Flow:
-    """OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/log/moving.md)."""
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    flow.setFinestScale(0)
-    flow.setVariationalRefinementIterations(0)
-    flow.setGradientDescentIterations(8)
-    flow.setPatchStride(STRIDE[False])
-    return lambda a, b: np.asarray(flow.calc(a, b, None), np.float32)  # type: ignore[call-overload]
-
-
-def filled(depth: Depth, surfaces: Surfaces) -> Depth:
-    """Measured depths, and those of planes where hardly any is measured."""
+    if surfaces is None:
+        return depth
+    # The depths of planes where hardly any is measured.
     is_measured, (inverse, error) = depth.inverse > 0, surfaces.enlarged(depth.inverse.shape)
     side = 2 * int(max(is_measured.shape) * AROUND / 2) + 1
     is_bare = ~is_measured & (_mean(is_measured.astype(np.float32), side) < MEASURED)

@@ -68,12 +68,6 @@ class KnownDepth:
     codes: Sequence[Codes]
     """[H, W, 2] each, by ``packed``; mapped from a file or computed when read, so that they take no memory."""
 
-    @staticmethod
-    def nothing(sizes: NDArray[np.float64]) -> KnownDepth:
-        """For images of these sizes (width, height); takes no memory."""
-        unknown = np.int16(UNKNOWN)
-        return KnownDepth(tuple(np.broadcast_to(unknown, (int(h), int(w), 2)) for w, h in sizes))
-
     def image(self, i: int) -> Map:
         """The numbers of one image. [H, W, 2]"""
         return unpacked(torch.from_numpy(np.require(self.codes[i], requirements="W"))).numpy()
@@ -116,23 +110,13 @@ def know_depths(
 ) -> tuple[KnownDepth | None, Observations]:
     """All available depths of the training images, and the observations with the points of a cloud, if there is one.
 
-    Args:
-        outputs: of the data parser.
-        observations: their cameras, tracks and loose points.
-        dataset: the images.
-        rays: makes rays through their pixel centres (image, row, column).
-        dense: whether to match neighbouring images.
-        sensor: whether to read depth images.
-
-    Returns:
-        The depths; None if there is neither matching, a sensor nor a cloud. The observations.
-
-    Raises:
-        InputError: an image or a depth image cannot be used (names it).
+    ``dense`` matches neighbouring images, ``sensor`` reads depth images; without both and a cloud the depths are None.
+    Raises InputError naming an image or a depth image that cannot be used.
     """
     if not (dense or sensor or observations.loose is not None):
         return None, observations
-    depths, posed = KnownDepth.nothing(observations.sizes), posed_images(observations, dataset)
+    unknown = (np.broadcast_to(np.int16(UNKNOWN), (int(h), int(w), 2)) for w, h in observations.sizes)  # of no memory
+    depths, posed = KnownDepth(tuple(unknown)), posed_images(observations, dataset)
     files = outputs.metadata.get("depth_filenames") if sensor else None
     if posed is None or not (dense or files or observations.loose is not None):
         return depths, observations
@@ -198,11 +182,7 @@ def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
 def with_sensor(depths: KnownDepth, files: list[Path], unit: float, posed: PosedImages) -> KnownDepth:
     """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept.
 
-    Args:
-        depths: those of other sources.
-        files: depth image of each training image.
-        unit: length of a depth of 1, scene units.
-        posed: the training images.
+    ``files`` are the depth images of all training images, and ``unit`` is the length of a depth of 1, scene units.
     """
 
     def replaced(i: int) -> Codes:
@@ -224,17 +204,10 @@ def with_sensor(depths: KnownDepth, files: list[Path], unit: float, posed: Posed
 
 
 def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, shape: tuple[int, int]) -> Map:
-    """Inverse distances and errors [H, W, 2] of a training image's pixels from the depths of its view at working size.
+    """Inverse distances and errors [H, W, 2] of training image i's pixels from the depths of its view at working size.
 
     A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
     edge, is added to its error. One that is smaller than a working pixel takes the depth of that.
-
-    Args:
-        view: the image at working size.
-        depth: its depths.
-        posed: the training images.
-        i: the image's place in them.
-        shape: height and width of the training image.
     """
     height, width = (min(pair) for pair in zip(shape, view.gray.shape, strict=True))
     maps, distances = (depth.inverse, depth.error), np.empty((*shape, 2), np.float32)

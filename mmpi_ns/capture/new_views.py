@@ -74,11 +74,7 @@ class SharedPoints:
     ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
         """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
 
-        Args:
-            count: number of rays.
-            rays: makes rays through pixel centres (image, row, column).
-            g: generator for the points and the positions between the cameras.
-            exposures: of all training images; colours are divided by them. None: they are equal.
+        Colours are divided by the ``exposures`` of all training images; None: they are equal.
         """
         device = self.pixels.device
         chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
@@ -139,20 +135,10 @@ def find_shared_points(
     device: str | torch.device = "cpu",
     exposures: Float[Tensor, "M 3"] | None = None,
 ) -> SharedPoints | None:
-    """The points that two of the images show at the same depth; None if there are none.
+    """The points that two of the training ``images``, by number, show at the same depth; None if there are none.
 
-    Args:
-        dataset: the training images.
-        posed: their cameras.
-        depths: depths of their pixels.
-        rays: makes rays through pixel centres (image, row, column).
-        images: numbers of the images to compare.
-        seed: of the choice among more than ``MOST`` pixels.
-        device: of the result.
-        exposures: of all training images, by which colours are divided; None: they are equal.
-
-    Raises:
-        InputError: an image or mask cannot be used (names the file).
+    ``seed`` chooses among more than ``MOST`` pixels. ``exposures`` are those of all training images, by which colours
+    are divided; None: they are equal. Raises InputError naming an image or mask that cannot be used.
     """
     # Neighbours mostly stand side by side.
     show = held(

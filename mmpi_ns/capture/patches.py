@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.views import Map, Parallax, View
-from mmpi_ns.ops.patches import (
-    GRAZING,
-    OFFSETS,
-    Patches,
-    compare_planes,
-    others_of,
-    spread_planes,
-)
+from mmpi_ns.ops.patches import GRAZING, OFFSETS, Patches, compare_planes, others_of, spread_planes
 
 PIXELS = 220.0**2
 """Pixels of a view in the search, at most."""
@@ -84,16 +77,8 @@ class Surfaces:
 
 
 def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces | None:
-    """Planes through the pixels of a view.
-
-    Args:
-        view: what it shows.
-        others: its neighbours.
-        rough: inverse depths to start from, of which the range matters most. [H, W]
-
-    Returns:
-        The planes at a low resolution; None if the view is too small, or nothing is known of its depths.
-    """
+    """Planes through the pixels of a view at a low resolution; None if it is too small, or nothing is known of its
+    depths. ``rough`` are inverse depths to start from, of which the range matters most. [H, W]"""
     height, width = view.gray.shape
     smallest = max(1.0, (height * width / PIXELS) ** 0.5)
     if not others or min(height, width) < LEAST_SIDE * LEVELS[0][0] * smallest or not (rough > 0).any():

@@ -82,10 +82,6 @@ class ColorRatios(NamedTuple):
     falloff: Float[ndarray, "M 2"]
     """Change of r^2 and r^4 from the first to the second; r is 1 at the corners."""
 
-    @staticmethod
-    def join(parts: Sequence[ColorRatios]) -> ColorRatios:
-        return ColorRatios(*map(np.concatenate, zip(*parts, strict=True)))
-
 
 @dataclass(frozen=True)
 class Gains:
@@ -256,7 +252,7 @@ def color_ratios(
         ratios += [part for part in parts if part is not None]
         if i % TRIMMED == 0:
             give_back_freed_memory()
-    return ColorRatios.join(ratios) if ratios else None
+    return ColorRatios(*map(np.concatenate, zip(*ratios, strict=True))) if ratios else None
 
 
 def solve(
@@ -324,7 +320,7 @@ def exposure_of_view(
     ratios = [part for part in parts if part is not None]
     if not ratios:
         return None
-    joined = ColorRatios.join(ratios)
+    joined = ColorRatios(*map(np.concatenate, zip(*ratios, strict=True)))
     logs = np.log(exposures[joined.second]) - joined.log_ratios + joined.falloff @ falloff
     return np.exp(np.median(logs, 0))
 

@@ -87,24 +87,20 @@ class CameraRays:
         area = 1 / (self.focal[camera].prod(-1, keepdim=True) * local.square().sum(-1, keepdim=True))
         return RayBundle(poses[:, :, 3], directions, pixel_area=area, camera_indices=camera[:, None], metadata={})
 
-    def image(self, height: int, width: int, step: int = 1) -> RayBundle:
-        """Rays [H, W] through all pixels of the first camera, or through those of every n-th row and column."""
-        rows, columns = (torch.arange(min(step, n) // 2, n, step, device=self.focal.device) for n in (height, width))
-        parts = []
-        for some in rows.split(max(1, CHUNK // len(columns))):
-            y, x = torch.meshgrid(some, columns, indexing="ij")
-            parts.append(self(torch.stack([torch.zeros_like(x), y, x], -1).view(-1, 3)))
-        fields = ("origins", "directions", "pixel_area", "camera_indices")
-        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in fields}
-        return RayBundle(**joined, metadata={}).reshape((len(rows), len(columns)))
-
 
 def image_rays(camera: Cameras, step: int = 1) -> RayBundle:
-    """Rays [H, W] through the pixels of one camera, as of ``CameraRays.image``; nerfstudio's for other types."""
-    rays = CameraRays.of(camera, camera.device)
+    """Rays [H, W] through the pixels of one camera, or of every n-th row and column; nerfstudio's for other types."""
+    rays, sizes = CameraRays.of(camera, camera.device), (int(camera.height), int(camera.width))
     if rays is None:
         return camera.generate_rays(0, keep_shape=True)[::step, ::step]
-    return rays.image(int(camera.height), int(camera.width), step)
+    rows, columns = (torch.arange(min(step, n) // 2, n, step, device=camera.device) for n in sizes)
+    parts = []
+    for some in rows.split(max(1, CHUNK // len(columns))):
+        y, x = torch.meshgrid(some, columns, indexing="ij")
+        parts.append(rays(torch.stack([torch.zeros_like(x), y, x], -1).view(-1, 3)))
+    fields = ("origins", "directions", "pixel_area", "camera_indices")
+    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in fields}
+    return RayBundle(**joined, metadata={}).reshape((len(rows), len(columns)))
 
 
 @lru_cache(maxsize=2)

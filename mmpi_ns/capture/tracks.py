@@ -156,50 +156,44 @@ def triangulate(images: PosedImages) -> SfmModel:
     Deterministic for equal images and poses. A quick search is followed by a thorough one if it finds too little. The
     quick search takes about a third of a second for each image on one core, the thorough one a second. Raises
     InputError if an image file cannot be read."""
-    with sfm.quiet():
-        for effort in EFFORTS[:-1]:
-            tracks = _attempt(images, effort)
-            if len(tracks.seen_by) >= ENOUGH * len(images.files):
-                return tracks
-        return _attempt(images, EFFORTS[-1])
-
-
-def _attempt(images: PosedImages, effort: tuple[float, bool, int]) -> SfmModel:
-    pycolmap, pairs, error = load_pycolmap(), near_pairs(images.camera_to_worlds, NEIGHBOURS), np.nan
-    peak_threshold, guided, least = effort
-    with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
-        work, database = Path(folder) / "images", Path(folder) / "database.db"
-        work.mkdir()
-        # By their indices as names, since two folders may contain files of the same name.
-        names = [f"{i:06d}{file.suffix.lower()}" for i, file in enumerate(images.files)]
-        for name, file in zip(names, images.files, strict=True):
-            os.symlink(file.resolve(), work / name)
-        cameras = []
-        for i, (width, height) in enumerate(images.sizes.astype(int).tolist()):
-            lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
-            params = [*images.intrinsics[i], *images.distortion[i]]
-            camera = pycolmap.Camera(model=lens, width=width, height=height, params=params, camera_id=i + 1)
-            camera.has_prior_focal_length = True
-            cameras.append(camera)
-        opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
-        poses = dict(zip(names, map(sfm.rigid3d, opencv), strict=True))
-        model = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
-        sfm.write_images(model, database)
-        options = pycolmap.FeatureExtractionOptions()
-        options.max_image_size = LARGE
-        options.sift.first_octave = -1 if images.sizes.max() <= SMALL else 0
-        options.sift.peak_threshold = peak_threshold
-        sfm.find_features(database, work, names, options)
-        for file, features in zip(images.files, sfm.count_features(database), strict=True):
-            if features is None:
-                raise InputError(f"Training image {file} cannot be read: repair or remove it.")
-        if pairs:
-            named = [(names[i], names[j]) for i, j in pairs]
-            sfm.match_pairs(database, named, guided=guided, least=least)
-            error = _epipolar_error(database, model)
-            model = sfm.triangulate_points(model, database, work, pairs_alone=True)
-        tracks = read_reconstruction(model, MIN_TRACK)
-        return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
+    pycolmap, tracks, error = load_pycolmap(), None, np.nan
+    # By their indices as names, since two folders may contain files of the same name.
+    names = [f"{i:06d}{file.suffix.lower()}" for i, file in enumerate(images.files)]
+    pairs = [(names[i], names[j]) for i, j in near_pairs(images.camera_to_worlds, NEIGHBOURS)]
+    opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
+    poses = dict(zip(names, map(sfm.rigid3d, opencv), strict=True))
+    cameras = []
+    for i, (width, height) in enumerate(images.sizes.astype(int).tolist()):
+        lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
+        params = [*images.intrinsics[i], *images.distortion[i]]
+        camera = pycolmap.Camera(model=lens, width=width, height=height, params=params, camera_id=i + 1)
+        camera.has_prior_focal_length = True
+        cameras.append(camera)
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = LARGE
+    options.sift.first_octave = -1 if images.sizes.max() <= SMALL else 0
+    for contrast, guided, least in EFFORTS:
+        if tracks is not None and len(tracks.seen_by) >= ENOUGH * len(names):
+            break
+        with sfm.quiet(), tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
+            work, database = Path(folder) / "images", Path(folder) / "database.db"
+            work.mkdir()
+            for name, file in zip(names, images.files, strict=True):
+                os.symlink(file.resolve(), work / name)
+            model = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
+            sfm.write_images(model, database)
+            options.sift.peak_threshold = contrast
+            sfm.find_features(database, work, names, options)
+            for file, features in zip(images.files, sfm.count_features(database), strict=True):
+                if features is None:
+                    raise InputError(f"Training image {file} cannot be read: repair or remove it.")
+            if pairs:
+                sfm.match_pairs(database, pairs, guided=guided, least=least)
+                error = _epipolar_error(database, model)
+                model = sfm.triangulate_points(model, database, work, pairs_alone=True)
+            tracks = read_reconstruction(model, MIN_TRACK)
+    assert tracks is not None
+    return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
 
 
 def _epipolar_error(database: Path, model: Any) -> float:

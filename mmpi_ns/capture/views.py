@@ -147,6 +147,8 @@ class Parallax:
     linear: NDArray[np.float64]
     """a at a pixel (x, y) is this times (x, y, 1). [3, 3]"""
     b: NDArray[np.float32]
+    tensors: tuple[Tensor, Tensor]
+    """Both as compiled operations read them."""
 
     @staticmethod
     def between(view: View, neighbour: View) -> Parallax:
@@ -155,12 +157,8 @@ class Parallax:
         shift = axes @ neighbour.pose[:, :3].T @ (view.pose[:, 3] - neighbour.pose[:, 3])
         to_pixels = camera_matrix(neighbour.pinhole)
         linear = to_pixels @ turn @ np.linalg.inv(camera_matrix(view.pinhole))
-        return Parallax(linear, (to_pixels @ shift).astype(np.float32))
-
-    @property
-    def tensors(self) -> tuple[Tensor, Tensor]:
-        """As compiled operations read them."""
-        return torch.from_numpy(self.linear).float(), torch.from_numpy(self.b)
+        b = (to_pixels @ shift).astype(np.float32)
+        return Parallax(linear, b, (torch.from_numpy(linear).float(), torch.from_numpy(b)))
 
     def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
         """Pixels x and y of points at these inverse depths, far outside if behind, and their depths over those here."""
@@ -213,13 +211,7 @@ def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
 def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: bool = False) -> NDArray[Any]:
     """Values of an image at pixel places, centres at halves: interpolated, or the nearest pixel's and 0 outside.
 
-    Args:
-        image: [H, W] or [H, W, C], of any size.
-        x, y: places, of any one shape and number.
-        nearest: take the nearest pixel.
-
-    Returns:
-        The shape of ``x``, and channels if the image has several.
+    The image [H, W] or [H, W, C] may have any size, and the places any one shape, which the values have, too.
     """
     at_x, at_y = (np.subtract(c, 0.5, dtype=np.float32) for c in (x, y))
     mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.capture.rays import CameraRays
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.export.codes import coarse_differences, split_codes
 from mmpi_ns.export.details import STEP, StoredView, restored_view
 from mmpi_ns.ops.baked import reader
@@ -60,8 +61,8 @@ class Pose:
 
     def rays(self) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
         """Origins and unit directions through the centres of all pixels, row by row."""
-        matrices = (torch.tensor(x, dtype=torch.float32)[None] for x in (self.to_world, self.focal, self.center))
-        bundle = CameraRays(*matrices).image(self.size[1], self.size[0]).flatten()
+        camera = Cameras(torch.tensor(self.to_world, dtype=torch.float32)[None], *self.focal, *self.center, *self.size)
+        bundle = image_rays(camera).flatten()
         return bundle.origins.contiguous(), bundle.directions.contiguous()
 
 

@@ -107,35 +107,16 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         for image in images
     }
     rays, observations = {}, []  # rays in the camera, with z = 1
-    for place, (image, pose) in enumerate(zip(images, poses, strict=True)):
+    for n, (image, pose) in enumerate(zip(images, poses, strict=True)):
         pixels = np.array([p.xy for p in image.points2D], dtype=np.float64).reshape(-1, 2)
         rays[image.image_id] = np.asarray(model.cameras[image.camera_id].cam_from_img(pixels)).reshape(-1, 2)
         seen = points[image.image_id]
         directions = np.c_[rays[image.image_id], np.ones(len(seen))][seen >= 0] @ pose[:3, :3].T
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         center = np.tile(pose[:3, 3], (len(directions), 1))
-        observations.append((seen[seen >= 0], np.full(len(directions), place), center, directions))
+        observations.append((seen[seen >= 0], np.full(len(directions), n), center, directions))
     points_seen, frames, centers, directions = (np.concatenate(column) for column in zip(*observations, strict=True))
-    camera, order = model.cameras[images[0].camera_id], {image: i for i, image in enumerate(offered)}
-    return Witness(
-        name,
-        names,
-        np.array([order[n] for n in names], dtype=np.int64),
-        poses,
-        _pair_evidence(model, database, points, rays),
-        camera.mean_focal_length() / max(camera.width, camera.height),
-        scale_changes(points_seen, frames, centers, directions, len(names)),
-        says,
-        model,
-    )
-
-
-def _pair_evidence(
-    model: pycolmap.Reconstruction, database: Path, points: dict[int, Places], rays: dict[int, Array]
-) -> Pairs:
-    """Matches of every verified pair of registered images that became points, and that fit the poses."""
-    place = {image_id: i for i, image_id in enumerate(sorted(points))}
-    rows: list[tuple[int, ...]] = []
+    place, rows = {image.image_id: n for n, image in enumerate(images)}, []  # of pairs of registered images
     for a, b, matches in verified_matches(database):
         if a not in place or b not in place or len(matches) < MIN_INLIERS:
             continue
@@ -148,7 +129,18 @@ def _pair_evidence(
         rows.append((place[a], place[b], len(left), int(tracked.sum()), fitting, beside))
     table = np.array(rows, dtype=np.int64).reshape(-1, 6)
     low, high = table[:, :2].min(1, initial=len(place)), table[:, :2].max(1, initial=0)
-    return Pairs(low, high, *table[:, 2:].T.astype(np.float64))
+    camera, order = model.cameras[images[0].camera_id], {image: i for i, image in enumerate(offered)}
+    return Witness(
+        name,
+        names,
+        np.array([order[n] for n in names], dtype=np.int64),
+        poses,
+        Pairs(low, high, *table[:, 2:].T.astype(np.float64)),
+        camera.mean_focal_length() / max(camera.width, camera.height),
+        scale_changes(points_seen, frames, centers, directions, len(names)),
+        says,
+        model,
+    )
 
 
 def share(part: Array, whole: Array) -> float:

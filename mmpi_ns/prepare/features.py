@@ -19,15 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
-from mmpi_ns.capture.sfm import (
-    MIN_INLIERS,
-    count_features,
-    find_features,
-    match_pairs,
-    new_model,
-    quiet,
-    write_images,
-)
+from mmpi_ns.capture.sfm import MIN_INLIERS, count_features, find_features, new_model, quiet, write_images
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.utils.errors import InputError, progress
 from mmpi_ns.utils.files import whole
@@ -108,17 +100,6 @@ def extract(
         raise InputError(
             f"Hardly any features: {max(counted)} in the best image. The images are blank, blurred or masked over."
         )
-
-
-def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:
-    """Matches and verifies pairs of images (indices into ``photos``), but for those matched before; returns the number
-    of pairs with verified matches."""
-    with progress("Matching pairs", len(pairs)) as advance, quiet():
-        for start in range(0, len(pairs), PAIR_BATCH):
-            batch = pairs[start : start + PAIR_BATCH]
-            match_pairs(database, [(photos[i].name, photos[j].name) for i, j in batch], threads=threads)
-            advance(len(batch))
-    return len(matching_pairs(database))
 
 
 def matching_pairs(database: Path) -> list[tuple[int, int]]:

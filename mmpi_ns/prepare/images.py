@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,7 +63,12 @@ def find_images(folder: Path) -> list[Path]:
     than two."""
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of images and no video ({', '.join(VIDEOS)}).")
-    readable = (*IMAGES, *(HEIF if reads_heif() else ()))
+    readable = IMAGES
+    with suppress(ImportError):  # without it Pillow reads no HEIC
+        from pillow_heif import register_heif_opener  # type: ignore[import-not-found]
+
+        register_heif_opener()
+        readable += HEIF
     files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
     images = [p for p in files if p.suffix.lower() in readable]
     images = [p for p in images if p.parent == folder] or images
@@ -84,16 +90,6 @@ def find_images(folder: Path) -> list[Path]:
     return sorted(images, key=lambda p: natural_key(str(p.relative_to(folder))))
 
 
-def reads_heif() -> bool:
-    """Whether Pillow reads HEIC, which pillow-heif teaches it."""
-    try:
-        from pillow_heif import register_heif_opener  # type: ignore[import-not-found]
-    except ImportError:
-        return False
-    register_heif_opener()
-    return True
-
-
 def in_short(names: Sequence[str], most: int = 4) -> str:
     """The first names, and the number of the others."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
@@ -104,34 +100,26 @@ def natural_key(text: str) -> list[tuple[int, int | str]]:
     return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", text) if part]
 
 
-def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
-    """Unique names in the scene: the file names, prefixed with the names of their subfolders."""
-    names, used = [], set()
-    for file in files:
-        # COLMAP's list of pairs is split at blanks
-        stem = re.sub(r"\s+", "_", "-".join(file.relative_to(folder).with_suffix("").parts))
-        kind = file.suffix.lower()
-        name = stem + (file.suffix if kind in (".jpg", ".jpeg", ".png") else ".jpg" if kind in HEIF else ".png")
-        while Path(name).stem.lower() in used:  # masks and downscaled copies go by the stem
-            name = Path(name).stem + "_" + Path(name).suffix
-        used.add(Path(name).stem.lower())
-        names.append(name)
-    return names
-
-
 def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
-    """Copies images upright into ``target/images``, unless they are there; reads sizes and EXIF. Raises InputError
-    naming an image that cannot be read."""
+    """Copies images upright into ``target/images``, unless they are there, under their names with those of subfolders
+    before; reads sizes and EXIF. Raises InputError naming an image that cannot be read."""
     (target / "images").mkdir(parents=True, exist_ok=True)
-    photos = []
+    photos, used = [], set()
     with progress("Reading images", len(files)) as advance:
-        for file, name in zip(files, scene_names(files, folder), strict=True):
+        for file in files:
+            # COLMAP's list of pairs is split at blanks; masks and downscaled copies go by the stem.
+            stem = re.sub(r"\s+", "_", "-".join(file.relative_to(folder).with_suffix("").parts))
+            while stem.lower() in used:
+                stem += "_"
+            used.add(stem.lower())
+            kind = file.suffix.lower()
+            name = stem + (file.suffix if kind in (".jpg", ".jpeg", ".png") else ".jpg" if kind in HEIF else ".png")
             image, copy = open_image(file), target / "images" / name
             exif = image.getexif()
             is_turned = exif.get(ExifTags.Base.Orientation, 1) not in (0, 1)
             size = ImageOps.exif_transpose(image).size if is_turned else image.size
             if not copy.exists():
-                is_read = file.suffix.lower() in KEPT.get(image.format or "", ()) and image.mode in ("L", "RGB", "RGBA")
+                is_read = kind in KEPT.get(image.format or "", ()) and image.mode in ("L", "RGB", "RGBA")
                 with whole(copy) as partial:
                     if is_read and not is_turned:
                         shutil.copyfile(file, partial)
@@ -144,8 +132,8 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
                             upright = Image.fromarray(np.clip(values / top * 255, 0, 255).astype(np.uint8))
                         has_alpha = upright.mode in ("RGBA", "LA", "PA") and copy.suffix.lower() == ".png"
                         upright = upright.convert("L" if upright.mode in ("1", "L") else "RGBA" if has_alpha else "RGB")
-                        kind = "PNG" if copy.suffix.lower() == ".png" else "JPEG"
-                        upright.save(partial, format=kind, quality=QUALITY, subsampling=0, exif=kept_tags(image))
+                        form = "PNG" if copy.suffix.lower() == ".png" else "JPEG"
+                        upright.save(partial, format=form, quality=QUALITY, subsampling=0, exif=kept_tags(image))
             shot = exif.get_ifd(ExifTags.IFD.Exif)
             parts = [exif.get(tag) for tag in BODY_TAGS] + [shot.get(tag) for tag in FOCAL_TAGS]
             lens = " ".join(str(part).strip() for part in parts if part)

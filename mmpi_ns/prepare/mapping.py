@@ -25,7 +25,7 @@ from mmpi_ns.capture.sfm import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.adjustment import STILL, Free, is_bent, polish, quality, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.features import matching_pairs
-from mmpi_ns.prepare.noted_focal import is_focal_open, noted_focals, with_focals
+from mmpi_ns.prepare.noted_focal import open_focals, with_focals
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, best_first, judge_alone, judge_together
 from mmpi_ns.utils.errors import InputError, progress, say
 
@@ -223,13 +223,9 @@ def map_globally(
 ) -> pycolmap.Reconstruction | None:
     """The largest model of the global mapper, None if there is none; read back where it was made before.
 
-    Every random draw is seeded, small angles are kept, and given intrinsics left alone.
-
-    Args:
-        task, threads: what is to be mapped, and CPU threads.
-        name: of the start: its folder gets the models.
-        focals: focal lengths to start from, in pixels by camera id; the others are those of the database.
-        names: the images to place.
+    Every random draw is seeded, small angles are kept, and given intrinsics left alone. ``focals`` are focal lengths to
+    start from, in pixels by camera id (the others are those of the database), ``name`` is that of the start, whose
+    folder gets the models, and ``names`` are the images to place.
     """
     folder, folders, refine = task.work / name, task.work / name / "models", task.free.lens
     if not (folder / "done").exists():
@@ -270,12 +266,12 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
         model = copy.deepcopy(chosen.model)
         model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
         advance()
-    noted = noted_focals(task.database) if task.free.lens else {}
-    if not is_focal_open(model, noted, task.threads):
-        model = polish(model, task.free, task.threads)
-    else:
+    noted = open_focals(model, task.database, task.threads) if task.free.lens else {}
+    if noted:
         model, *rest = (with_focals(m, noted, task.threads) for m in (model, *(w.model for w in others)))
         others = [witness_of(w.name, w.says, m, task.database, task.offered) for w, m in zip(others, rest, strict=True)]
+    else:
+        model = polish(model, task.free, task.threads)
     polished = witness_of(chosen.name, chosen.says, model, task.database, task.offered)
     before, after = (ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished))
     if after > before:

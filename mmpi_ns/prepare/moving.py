@@ -36,7 +36,17 @@ def write_masks(
     if threads > 0:
         torch.set_num_threads(threads)
     entries = [model.images[i] for i in sorted(model.reg_image_ids()) if model.images[i].name in set(train)]
-    posed = _posed_images(model, entries, images)
+    poses = np.array([entry.cam_from_world().inverse().matrix() for entry in entries], np.float64)
+    cameras = [model.cameras[entry.camera_id] for entry in entries]
+    lenses, fisheye = (np.array(column) for column in zip(*map(opencv_intrinsics, cameras), strict=True))
+    posed = PosedImages(
+        files=tuple(images / entry.name for entry in entries),
+        camera_to_worlds=poses @ np.diag([1.0, -1.0, -1.0, 1.0]),
+        intrinsics=lenses[:, :4],
+        sizes=np.array([[camera.width, camera.height] for camera in cameras], np.float64),
+        distortion=lenses[:, 4:],
+        fisheye=fisheye,
+    )
     views, moving, doubt = find_moving(
         posed,
         lambda i: np.reshape(
@@ -59,17 +69,3 @@ def write_masks(
     colors = ((entry.name, straightened_color(posed, i, views[i])) for i, entry in enumerate(entries))
     draw_moving(picture, colors, moving)
     return shares, doubt
-
-
-def _posed_images(model: pycolmap.Reconstruction, entries: Sequence[pycolmap.Image], folder: Path) -> PosedImages:
-    cameras = [model.cameras[entry.camera_id] for entry in entries]
-    lenses, fisheye = zip(*map(opencv_intrinsics, cameras), strict=True)
-    poses = np.array([entry.cam_from_world().inverse().matrix() for entry in entries], np.float64)
-    return PosedImages(
-        files=tuple(folder / entry.name for entry in entries),
-        camera_to_worlds=poses @ np.diag([1.0, -1.0, -1.0, 1.0]),
-        intrinsics=np.array(lenses)[:, :4],
-        sizes=np.array([[camera.width, camera.height] for camera in cameras], np.float64),
-        distortion=np.array(lenses)[:, 4:],
-        fisheye=np.array(fisheye),
-    )

@@ -19,12 +19,6 @@ images determine it; share of the reprojection error with that of EXIF to which 
 that of EXIF, as it changes all heights."""
 
 
-def noted_focals(database: Path) -> dict[int, float]:
-    """Focal lengths that a database of features has from EXIF, in pixels by camera."""
-    with pycolmap.Database.open(database) as opened:
-        return {c.camera_id: c.mean_focal_length() for c in opened.read_all_cameras() if c.has_prior_focal_length}
-
-
 def with_focals(model: pycolmap.Reconstruction, focals: Mapping[int, float], threads: int) -> pycolmap.Reconstruction:
     """A copy adjusted with given focal lengths, in pixels by camera; those of other cameras stay."""
     held = copy.deepcopy(model)
@@ -38,23 +32,25 @@ def with_focals(model: pycolmap.Reconstruction, focals: Mapping[int, float], thr
     return held
 
 
-def is_focal_open(model: pycolmap.Reconstruction, noted: Mapping[int, float], threads: int) -> bool:
-    """Whether the images hardly determine the focal lengths, but end elsewhere than the ``noted`` ones, in pixels by
-    camera: with those the error is hardly larger."""
+def open_focals(model: pycolmap.Reconstruction, database: Path, threads: int) -> dict[int, float]:
+    """Focal lengths that a database of features has from EXIF, in pixels by camera, if the images hardly determine
+    them, but end elsewhere: with those of EXIF the error is hardly larger. Else empty."""
+    with pycolmap.Database.open(database) as opened:
+        cameras = [c for c in opened.read_all_cameras() if c.has_prior_focal_length]
+    noted = {c.camera_id: c.mean_focal_length() for c in cameras}
     apart = [abs(camera.mean_focal_length() / noted[n] - 1) for n, camera in model.cameras.items() if n in noted]
     if not apart or max(apart) < OFF:
-        return False
+        return {}
     light = with_fewer_points(model)
     adjust(light, threads, lens=True)
-    free, held = _error_of(light), _error_of(with_focals(light, noted, threads))
+    # Root mean squares of the points' errors in pixels, where single points that are lost count little.
+    errors = (
+        np.array([min(point.error, LARGEST_ERROR) for point in m.points3D.values()])
+        for m in (light, with_focals(light, noted, threads))
+    )
+    free, held = (float(np.sqrt((each**2).mean())) for each in errors)
     is_open = free > WORTH * held
     focals = ", ".join(f"{focal:.0f}" for _, focal in sorted(noted.items())[:3])
     fate = "kept, as the images hardly determine it" if is_open else "not kept"
     say(f"Lens: {free:.3f} px, {held:.3f} px with the focal length of EXIF ({focals} px): {fate}.")
-    return is_open
-
-
-def _error_of(model: pycolmap.Reconstruction) -> float:
-    """Root mean square of the points' errors in pixels, where single points that are lost count little."""
-    errors = np.array([min(point.error, LARGEST_ERROR) for point in model.points3D.values()])
-    return float(np.sqrt((errors**2).mean()))
+    return noted if is_open else {}

@@ -19,17 +19,18 @@ import pycolmap
 from filelock import FileLock, Timeout
 from scipy.cluster.hierarchy import DisjointSet
 
-from mmpi_ns.capture.sfm import load_pycolmap, new_model, rigid3d
+from mmpi_ns.capture.sfm import load_pycolmap, match_pairs, new_model, quiet, rigid3d
 from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images
 from mmpi_ns.prepare.adjustment import Free, camera_poses, choose_frame, focal_interval, map_known_poses
 from mmpi_ns.prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.poses import make_cameras, parse_camera, read_poses
-from mmpi_ns.prepare.settings import Settings, check_settings, read_lists
+from mmpi_ns.prepare.settings import RANGES, Settings, read_lists
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.utils.errors import FULL, InputError, looked_at, progress, quoted, say
 from mmpi_ns.utils.files import whole, write_text
+from mmpi_ns.utils.values import check_options
 
 WORK = ".prepare"
 WORDS = {"input": "reading", "masks": "reading", "features": "features", "matches": "matching", "model": "mapping"}
@@ -162,8 +163,12 @@ class Preparation:
         else:
             alike = features.image_similarity(database, len(names))
             pairs, says = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
-        verified = features.match(database, self.photos, pairs, s.threads)
-        return f"{says}; {verified} of {len(pairs)} pairs match"
+        with progress("Matching pairs", len(pairs)) as advance, quiet():
+            for start in range(0, len(pairs), features.PAIR_BATCH):  # but for those matched before
+                batch = [(names[i], names[j]) for i, j in pairs[start : start + features.PAIR_BATCH]]
+                match_pairs(database, batch, threads=s.threads)
+                advance(len(batch))
+        return f"{says}; {len(features.matching_pairs(database))} of {len(pairs)} pairs match"
 
     def _map(self, database: Path, folder: Path) -> dict[str, Any]:
         """Makes the model; how, the verdict, the interval of a refined focal length, and groups of at least
@@ -293,11 +298,7 @@ class Preparation:
         return [*findings, *(checks.Finding("moving?", n, f"{x:.0%} {words}", x) for n, x in moves.items())], None, says
 
     def _publish(
-        self,
-        findings: Sequence[checks.Finding],
-        model: pycolmap.Reconstruction,
-        verdict: Verdict,
-        split: export.Split,
+        self, findings: Sequence[checks.Finding], model: pycolmap.Reconstruction, verdict: Verdict, split: export.Split
     ) -> None:
         """Moves the scene into place and reports the result; doubtful ones in red."""
         scene = self.settings.scene
@@ -342,23 +343,39 @@ def only_one(work: Path) -> Iterator[None]:
         raise
 
 
-def prepare(settings: Settings) -> Verdict:
-    """Makes the scene; returns how far it can be believed. Raises InputError if the input is missing or cannot be
-    made into a scene, or something would be lost in its folder."""
+def prepare(s: Settings) -> Verdict:
+    """Makes the scene; returns how far it can be believed.
+
+    Before any work it raises InputError if an option is out of range, contradicts another or names no file, the input
+    is missing, or something would be lost in the scene's folder; later, if the input cannot be made into a scene.
+    """
     load_pycolmap()  # in a version that is new enough
-    check_settings(settings)
-    source, scene = settings.input.resolve(), settings.scene.resolve()
-    if not source.exists():
-        raise InputError(f"There is no {looked_at(settings.input)}: check the path.")
-    if settings.scene.is_file():
-        raise InputError(f"{settings.scene} is a file: name a folder for the scene.")
+    check_options(s, {name: number for name, number in RANGES.items() if getattr(s, name) is not None}, "--")
+    every, threads = (s.test_every, s.train_every), s.threads
+    source, scene = s.input.resolve(), s.scene.resolve()
+    faults = {
+        "--focal and --camera both give a focal length: leave one out.": None not in (s.focal, s.camera),
+        "--test-every and --train-every contradict each other: leave one out.": None not in every,
+        f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.": (s.test_every or 2) < 2,
+        f"--downscales takes different numbers, not {s.downscales}.": len(set(s.downscales)) < len(s.downscales),
+        f"--threads takes a number of threads, or -1 for all cores, not {threads}.": threads < 1 and threads != -1,
+        "--refine-poses refines known poses: give them with --poses.": s.refine_poses and s.poses is None,
+        f"--poses {s.poses} does not exist.": s.poses is not None and not s.poses.exists(),
+        f"--masks {s.masks} is no folder.": s.masks is not None and not s.masks.is_dir(),
+        f"There is no {looked_at(s.input)}: check the path.": not source.exists(),
+        f"{s.scene} is a file: name a folder for the scene.": s.scene.is_file(),
+    }
+    for says in (says for says, is_wrong in faults.items() if is_wrong):
+        raise InputError(says)
+    if s.split_from is not None:
+        read_lists(s.split_from)
     taken = export.existing_parts(scene)
     if scene == source or source in scene.parents or any((scene / part) in (source, *source.parents) for part in taken):
-        raise InputError(f"The scene {settings.scene} would be mixed with its input: name another folder.")
-    if taken and not settings.overwrite:
+        raise InputError(f"The scene {s.scene} would be mixed with its input: name another folder.")
+    if taken and not s.overwrite:
         raise InputError(
-            f"{settings.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite "
-            "(the old files are then moved aside)."
+            f"{s.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite (the old files are "
+            "then moved aside)."
         )
-    with only_one(settings.scene / WORK):
-        return Preparation(settings).run()
+    with only_one(s.scene / WORK):
+        return Preparation(s).run()

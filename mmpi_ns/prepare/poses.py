@@ -112,11 +112,8 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
     """Reads known poses, a file or a folder of 4x4 text files, and matches them with the images. Raises InputError if
     they are not understood, or fit fewer than two images."""
     is_transforms = path.suffix.lower() == ".json"
-    if path.is_dir() or is_transforms:
-        read = (_read_transforms if is_transforms else _read_matrices)(path, photos)
-    else:
-        rows = _read_rows(path)
-        read = (_read_tum if rows.shape[1] == 8 else _read_kitti)(rows, path, photos)
+    reader = _read_transforms if is_transforms else _read_matrices if path.is_dir() else _read_lines
+    read = reader(path, photos)
     opengl = axes == "opengl" or (axes == "auto" and is_transforms)
     flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
     poses = {n: p @ flip for n, p in read.poses.items() if np.isfinite(p).all()}
@@ -132,8 +129,12 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
     return replace(read, poses=poses)
 
 
-def _read_rows(path: Path) -> Array:
-    """The numbers of a text file, 8 or 12 in each line; # begins a comment. [N, 8 or 12]"""
+def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+    """Poses in the lines of a text file, in which # begins a comment.
+
+    KITTI: 12 numbers, a line for each image; of more lines, the numbers in the file names choose (counted from 0). TUM:
+    8 numbers, by time stamp if the file names are time stamps, else a line for each image.
+    """
     text = path.read_text(encoding="utf-8", errors="replace")
     lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
     width, rows = len(next(filter(None, lines), [])), []
@@ -149,34 +150,25 @@ def _read_rows(path: Path) -> Array:
             raise InputError(f"{path}, line {number}: {error}.") from error
         if len(fields) != width:
             raise InputError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
-    return np.array(rows, dtype=np.float64)
-
-
-def _read_kitti(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """KITTI poses: one line for each image; of more lines, the numbers in the file names choose (counted from 0)."""
-    matrices = np.concatenate([rows.reshape(-1, 3, 4), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 1))], 1)
-    places: Sequence[int] = range(len(photos))
-    says = "KITTI poses, one line for each image"
-    if len(rows) != len(photos):
-        digits = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
-        places = [int(d[-1]) for d in digits if d]
-        if len(rows) < len(photos) or len(set(places)) < len(photos) or max(places) >= len(rows):
-            raise InputError(f"{path} has {len(rows)} poses for {len(photos)} images: they cannot be matched.")
-        says = "KITTI poses, the lines that the images' numbers name (from 0)"
-    return KnownPoses({p.name: matrices[i] for p, i in zip(photos, places, strict=True)}, says)
-
-
-def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """TUM poses: by time stamp if the file names are time stamps, else one line for each image."""
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    for pose, row in zip(poses, rows, strict=True):
+    numbers, poses = np.array(rows, dtype=np.float64), np.tile(np.eye(4), (len(rows), 1, 1))
+    places, says = list(range(len(photos))), "one line for each image"
+    if width == 12:
+        poses[:, :3] = numbers.reshape(-1, 3, 4)
+        if len(rows) != len(photos):
+            digits = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
+            places = [int(d[-1]) for d in digits if d]
+            if len(rows) < len(photos) or len(set(places)) < len(photos) or max(places) >= len(rows):
+                raise InputError(f"{path} has {len(rows)} poses for {len(photos)} images: they cannot be matched.")
+            says = "the lines that the images' numbers name (from 0)"
+        return KnownPoses({p.name: poses[i] for p, i in zip(photos, places, strict=True)}, f"KITTI poses, {says}")
+    for pose, row in zip(poses, numbers, strict=True):
         pose[:3, :3] = pycolmap.Rotation3d(row[4:8]).matrix() if np.linalg.norm(row[4:8]) > 0 else np.nan
         pose[:3, 3] = row[1:4]
     matched: dict[str, Array] = {}
     for photo in photos:
         source = Path(photo.source)
         stamps = re.findall(r"\d+\.\d+|\d+", source.stem if source.suffix.lower() in IMAGES else photo.source)
-        lags = np.abs(rows[:, 0] - float(stamps[-1])) if stamps else np.full(1, np.inf)
+        lags = np.abs(numbers[:, 0] - float(stamps[-1])) if stamps else np.full(1, np.inf)
         if lags.min() <= MAX_LAG:
             matched[photo.name] = poses[lags.argmin()]
     if 2 * len(matched) >= len(photos):
@@ -185,9 +177,7 @@ def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
         raise InputError(
             f"{path} has {len(rows)} poses for {len(photos)} images, and the images' names are not their time stamps."
         )
-    return KnownPoses(
-        {p.name: pose for p, pose in zip(photos, poses, strict=True)}, "TUM poses, one line for each image"
-    )
+    return KnownPoses({p.name: pose for p, pose in zip(photos, poses, strict=True)}, f"TUM poses, {says}")
 
 
 def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:

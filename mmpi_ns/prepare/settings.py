@@ -12,7 +12,7 @@ import tyro
 from mmpi_ns.prepare.features import Matching
 from mmpi_ns.prepare.poses import Lens, Sharing
 from mmpi_ns.utils.errors import InputError
-from mmpi_ns.utils.values import Number, check_options
+from mmpi_ns.utils.values import Number
 
 
 @dataclass(frozen=True)
@@ -87,27 +87,6 @@ RANGES = {
     **dict.fromkeys(("train_every", "max_frames", "downscales"), Number(2, whole=True)),
     "camera": Number(),
 }
-
-
-def check_settings(s: Settings) -> None:
-    """Checks the options before any work. Raises InputError if one is out of range, contradicts another, or names no
-    file."""
-    check_options(s, {name: number for name, number in RANGES.items() if getattr(s, name) is not None}, "--")
-    every, threads = (s.test_every, s.train_every), s.threads
-    faults = {
-        "--focal and --camera both give a focal length: leave one out.": None not in (s.focal, s.camera),
-        "--test-every and --train-every contradict each other: leave one out.": None not in every,
-        f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.": (s.test_every or 2) < 2,
-        f"--downscales takes different numbers, not {s.downscales}.": len(set(s.downscales)) < len(s.downscales),
-        f"--threads takes a number of threads, or -1 for all cores, not {threads}.": threads < 1 and threads != -1,
-        "--refine-poses refines known poses: give them with --poses.": s.refine_poses and s.poses is None,
-        f"--poses {s.poses} does not exist.": s.poses is not None and not s.poses.exists(),
-        f"--masks {s.masks} is no folder.": s.masks is not None and not s.masks.is_dir(),
-    }
-    for says in (says for says, is_wrong in faults.items() if is_wrong):
-        raise InputError(says)
-    if s.split_from is not None:
-        read_lists(s.split_from)
 
 
 def read_lists(path: Path) -> dict[str, list[str]]:

@@ -9,16 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from mmpi_ns.prepare.evidence import (
-    FEW,
-    Array,
-    Witness,
-    agreement,
-    bridges,
-    held_by_side,
-    share,
-    strides,
-)
+from mmpi_ns.prepare.evidence import FEW, Array, Witness, agreement, bridges, held_by_side, share, strides
 from mmpi_ns.prepare.images import in_short
 
 Grade = Literal["right", "doubtful", "broken"]

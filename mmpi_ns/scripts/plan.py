@@ -108,18 +108,15 @@ def _mark(plan: Path) -> str:
     return f"<!-- plan.json: {hashlib.sha256(plan.read_bytes()).hexdigest()} -->"
 
 
-def _defaults(arguments: list[str]) -> PlanCommand:
-    """The command with the placement of the method that the arguments name."""
-    words = [w for argument in arguments for w in argument.split("=", 1)]
-    method = words[words.index("--method") + 1] if "--method" in words[:-1] else ""
-    default = DEFAULTS.get(method, DEFAULTS["mmpi-small"])
-    return PlanCommand(tyro.MISSING, tyro.MISSING, placement=default.placement)
-
-
 def entrypoint() -> None:
     """The command ``mmpi-plan``; a problem with the scene or the plan ends it with one sentence and status 1."""
     say_version("mmpi-plan")
-    command = tyro.cli(PlanCommand, default=_defaults(sys.argv[1:]), description=PlanCommand.__doc__)
+    # The placement of the method that the arguments name.
+    words = [w for argument in sys.argv[1:] for w in argument.split("=", 1)]
+    method = words[words.index("--method") + 1] if "--method" in words[:-1] else ""
+    usual = DEFAULTS.get(method, DEFAULTS["mmpi-small"]).placement
+    default = PlanCommand(tyro.MISSING, tyro.MISSING, placement=usual)
+    command = tyro.cli(PlanCommand, default=default, description=PlanCommand.__doc__)
     enter_command()
     command.main()
 

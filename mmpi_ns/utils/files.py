@@ -17,16 +17,8 @@ if TYPE_CHECKING:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], folder: Path | None = None) -> None:
-    """Writes to a temporary file on the same disk and renames it; removes it when writing fails.
-
-    Args:
-        path: the finished file.
-        write: writes to the path it is given.
-        folder: where the unfinished file lies; beside the finished one unless given.
-
-    Raises:
-        WriteError: it could not be written (says why and what is left).
-    """
+    """Calls ``write`` with a temporary path on the same disk, in ``folder`` or beside the finished file, and renames
+    that; removes it when writing fails. Raises WriteError, which says why and what is left."""
     temporary = (folder or path.parent) / f".{path.name}.{os.getpid()}.tmp"
     try:
         write(temporary)

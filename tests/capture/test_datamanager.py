@@ -19,7 +19,7 @@ from mmpi_ns.capture import known_depth, rays
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.known_depth import UNKNOWN, KnownDepth
 from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
-from mmpi_ns.capture.rays import CameraRays
+from mmpi_ns.capture.rays import CameraRays, image_rays
 from mmpi_ns.capture.sfm import MIN_TRACK
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scene.plan import ScenePlan
@@ -188,7 +188,7 @@ def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie
     distances = np.linalg.norm(placed.points[placed.seen_point] - placed.centers[placed.seen_by], axis=-1)
     assert len(expected) > 30 and len(placed.seen_at) == 0
     assert np.allclose(np.stack([placed.seen_by, distances], -1), expected, rtol=1e-5)
-    nothing = KnownDepth.nothing(manager.observations.sizes)
+    nothing = KnownDepth([np.full((HEIGHT, WIDTH, 2), UNKNOWN, np.int16)] * len(manager.train_dataset))
     assert known_depth.of_cells(manager.observations, nothing, manager.train_dataset) is manager.observations
 
 
@@ -325,10 +325,10 @@ def test_rays_of_pinhole_cameras_are_nerfstudios(scene):
     for name in ("origins", "directions", "camera_indices"):
         assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6), name
     assert ours.pixel_area.shape == theirs.pixel_area.shape
-    image, whole = made.image(HEIGHT, WIDTH), cameras[0:1].generate_rays(camera_indices=0, keep_shape=True)
+    image, whole = image_rays(cameras[0:1]), cameras[0:1].generate_rays(camera_indices=0, keep_shape=True)
     for name in ("origins", "directions", "camera_indices"):
         assert getattr(image, name).shape == getattr(whole, name).shape
-        assert torch.equal(getattr(made.image(HEIGHT, WIDTH, 3), name), getattr(image, name)[1::3, 1::3]), name
+        assert torch.equal(getattr(image_rays(cameras[0:1], 3), name), getattr(image, name)[1::3, 1::3]), name
         assert torch.allclose(getattr(image, name), getattr(whole, name), atol=1e-6), name
 
 
@@ -357,9 +357,9 @@ def test_rays_through_a_lens_are_nerfstudios(scene, kind, monkeypatch):
     for name in ("origins", "directions", "camera_indices"):
         assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6), name
     for i in (1, 4):
-        alone = CameraRays.of(cameras[i : i + 1], "cpu")
-        whole = cameras[i : i + 1].generate_rays(camera_indices=0, keep_shape=True)
-        image = alone.image(HEIGHT, int(cameras.width[i]))
+        alone = cameras[i : i + 1]
+        assert CameraRays.of(alone, "cpu") is not None
+        image, whole = image_rays(alone), alone.generate_rays(camera_indices=0, keep_shape=True)
         assert image.directions.shape == whole.directions.shape
         assert torch.allclose(image.directions, whole.directions, atol=1e-6)
 

@@ -16,6 +16,7 @@ from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.known_depth import (
     POINT_ERROR,
     SENSOR_ERROR,
+    UNKNOWN,
     KnownDepth,
     at_training_pixels,
     packed,
@@ -117,6 +118,10 @@ def test_stored_distances_are_off_by_a_tenth_of_their_least_error_and_0_stays_un
     assert found[0, 0, 0] == 0 and (found.reshape(-1)[1:] > 0).all()
 
 
+def nothing_known():
+    return KnownDepth([np.full((60, 80, 2), UNKNOWN, np.int16)] * 2)
+
+
 def seen(points, cameras, at):
     """Observations of a camera at the origin and one a unit behind it."""
     poses = np.tile(np.eye(4)[:3], (2, 1, 1))
@@ -134,7 +139,7 @@ def seen(points, cameras, at):
 
 def test_points_set_the_distance_of_the_pixels_that_saw_them_the_nearest_where_several_did():
     observations = seen([[0, 0, -4], [0, 0, -2], [0, 0, -3]], [0, 0, 1], [[40.9, 30.2], [40.1, 30.7], [3, 5]])
-    nothing = KnownDepth.nothing(observations.sizes)
+    nothing = nothing_known()
     found = with_points(nothing, observations)
     first, second = found.image(0), found.image(1)
     assert first[30, 40] == pytest.approx([0.5, POINT_ERROR / 2], rel=STEP) and (first[..., 0] > 0).sum() == 1
@@ -206,7 +211,7 @@ def test_a_depth_image_that_cannot_be_read_is_named(tmp_path, content):
 
 def test_the_observations_need_no_points():
     observations = seen(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)))
-    assert with_points(KnownDepth.nothing(observations.sizes), observations).share == 0
+    assert with_points(nothing_known(), observations).share == 0
 
 
 def test_threads_read_cached_depths_one_at_a_time(monkeypatch):

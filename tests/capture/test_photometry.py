@@ -24,7 +24,11 @@ def drive(logs, *, falloff=(0.0, 0.0), noise=0.02, seed=0, neighbours=3, outlier
             wrong = rng.random(len(ratio)) < outliers
             ratio[wrong] += rng.normal(0.3, 0.3, (wrong.sum(), 3))
             parts.append(grouped(i, j, ratio, (before[seen], after[seen])))
-    return ColorRatios.join([part for part in parts if part is not None])
+    return joined([part for part in parts if part is not None])
+
+
+def joined(parts):
+    return ColorRatios(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def wandering(count=12, seed=1):
@@ -80,7 +84,7 @@ def test_exif_ties_images_that_no_match_connects():
     halves = [drive(truth[:3]), drive(truth[3:])]
     second = halves[1]
     second = ColorRatios(second.first + 3, second.second + 3, second.log_ratios, second.errors, second.falloff)
-    ratios = ColorRatios.join([halves[0], second])
+    ratios = joined([halves[0], second])
     exposures = np.array([1, 1.2, 1.1, 3, 3.3, 2.8])
     without, (logs, *_) = solve(ratios, 6)[0], solve(ratios, 6, exposures)
     step = truth[3:].mean() - truth[:3].mean()

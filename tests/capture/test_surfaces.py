@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from value_noise import noise
 
-from mmpi_ns.capture.dense import ROUNDS, Depth, confirmed, filled, matched
+from mmpi_ns.capture import dense
+from mmpi_ns.capture.dense import ROUNDS, Depth, confirmed, matched
 from mmpi_ns.capture.patches import Surfaces, search_surfaces
 from mmpi_ns.capture.views import View
 
@@ -140,13 +141,18 @@ def test_images_of_any_size_are_matched(size):
     assert isinstance(depth, Depth) and depth.inverse.shape == size and not depth.inverse.any()
 
 
-def test_planes_fill_what_is_bare_and_not_the_gaps_between_measured_depths():
+def test_planes_fill_what_is_bare_and_not_the_gaps_between_measured_depths(monkeypatch):
     measured = np.zeros((60, 100), np.float32)
     measured[:, :50] = 2.0
     measured[20:23, 20:23] = 0  # side of the square: 5 pixels
     planes = np.zeros((30, 50, 3), np.float32)
     planes[..., 0] = 1.0
-    depth = filled(Depth(measured, 0.1 * measured), Surfaces(planes, np.full((30, 50), 0.2, np.float32)))
+    surfaces = Surfaces(planes, np.full((30, 50), 0.2, np.float32))
+    monkeypatch.setattr(dense, "search_surfaces", lambda *_: surfaces)
+    monkeypatch.setattr(dense, "without_fringes", lambda *_: Depth(measured, 0.1 * measured))
+    blank, inside = np.zeros((60, 100), np.uint8), np.ones((60, 100), bool)
+    view = View(blank, np.array([90.0, 90, 50, 30]), np.eye(3, 4), inside)
+    depth = matched(view, [view], np.array([[0.0, 0, -1]]))
     assert (depth.inverse[:, :50] == measured[:, :50]).all() and (
         depth.error[:, :50] == np.float32(0.1) * measured[:, :50]
     ).all()

@@ -140,23 +140,23 @@ def test_perspective_and_fisheye_images_are_matched_with_each_other(tmp_path):
 
 
 def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, images, monkeypatch):
-    efforts, attempt = [], triangulation._attempt
+    efforts, faintest = [], []
+    extract, match = pycolmap.extract_features, pycolmap.match_image_pairs
 
-    def spy(images, effort):
-        efforts.append(effort)
-        return attempt(images, effort)
+    def spy_extract(*args, extraction_options, **options):
+        faintest.append(extraction_options.sift.peak_threshold)
+        return extract(*args, extraction_options=extraction_options, **options)
 
-    match, guided = pycolmap.match_image_pairs, []
+    def spy_match(*args, matching_options, verification_options, **options):
+        efforts.append((faintest[-1], matching_options.guided_matching, verification_options.min_num_inliers))
+        options |= {"matching_options": matching_options, "verification_options": verification_options}
+        return match(*args, **options)
 
-    def spy_match(*args, matching_options, **options):
-        guided.append(matching_options.guided_matching)
-        return match(*args, matching_options=matching_options, **options)
-
-    monkeypatch.setattr(triangulation, "_attempt", spy)
+    monkeypatch.setattr(pycolmap, "extract_features", spy_extract)
     monkeypatch.setattr(pycolmap, "match_image_pairs", spy_match)
     faint = scene_of(tmp_path, POSES[:4], contrast=0.12)
     points = triangulate(faint).points
-    assert efforts == list(EFFORTS) and guided == [False, True] and np.median(depth_error(points)) < 0.02
+    assert efforts == list(EFFORTS) and len(faintest) == len(EFFORTS) and np.median(depth_error(points)) < 0.02
     monkeypatch.setattr(triangulation, "EFFORTS", EFFORTS[:1])
     assert len(triangulate(faint).points) < 0.5 * len(points)
     monkeypatch.setattr(triangulation, "EFFORTS", (EFFORTS[1], EFFORTS[0]))

@@ -17,7 +17,7 @@ from mmpi_ns.placement.observations import find_visible_points
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.placement.show import describe_facing, explain, table
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.scripts.plan import _defaults, entrypoint
+from mmpi_ns.scripts.plan import PlanCommand, entrypoint
 from mmpi_ns.utils.errors import InputError
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
@@ -62,14 +62,17 @@ def test_an_edited_plan_is_explained_and_kept(scene, tmp_path, monkeypatch, caps
     )
 
 
-def test_the_defaults_are_those_of_the_method():
+def test_the_defaults_are_those_of_the_method(tmp_path, monkeypatch):
+    commands = []
+    monkeypatch.setattr(PlanCommand, "main", lambda command: commands.append(command))
     for name, method in (("mmpi", mmpi), ("mmpi-small", mmpi_small)):
         for words in (["scene", "--method", name], [f"--method={name}", "scene"]):
-            command = _defaults(words)
-            assert command.placement == method.config.pipeline.model.placement
+            run(monkeypatch, *words, "--output", tmp_path)
+            assert commands[-1].placement == method.config.pipeline.model.placement
             rays = method.config.pipeline.datamanager.train_num_rays_per_batch
             assert DEFAULTS[name].rays == rays
-    assert _defaults(["scene"]).placement == mmpi_small.config.pipeline.model.placement
+    run(monkeypatch, "scene", "--output", tmp_path)
+    assert commands[-1].placement == mmpi_small.config.pipeline.model.placement
 
 
 def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch):

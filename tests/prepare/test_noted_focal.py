@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from test_prepare_parts import model_of
 
-from mmpi_ns.prepare.noted_focal import is_focal_open, noted_focals, with_focals
+from mmpi_ns.prepare.noted_focal import open_focals, with_focals
 
 TRUE, LENS = 300.0, {"model": "SIMPLE_RADIAL", "width": 200, "height": 160, "camera_id": 1}
 
@@ -39,27 +39,36 @@ def a_flight(tilt, focal):
     return model
 
 
+def noting(path, *focals, known=True):
+    """A database of features with cameras of these focal lengths."""
+    with pycolmap.Database.open(path) as database:
+        for focal in focals:
+            camera = pycolmap.Camera(params=[focal, 100, 80, 0.0], **LENS)
+            camera.has_prior_focal_length = known
+            database.write_camera(camera)
+    return path
+
+
 @pytest.mark.parametrize(
     ("tilt", "focal", "noted", "is_open"), [(0.0, 1.3 * TRUE, TRUE, True), (0.1, TRUE, 1.3 * TRUE, False)]
 )
-def test_only_cameras_that_all_look_the_same_way_leave_the_focal_length_open(tilt, focal, noted, is_open, capsys):
+def test_only_cameras_that_all_look_the_same_way_leave_the_focal_length_open(
+    tilt, focal, noted, is_open, tmp_path, capsys
+):
     model = a_flight(tilt, focal)
-    assert is_focal_open(model, {1: noted}, 1) == is_open
+    assert open_focals(model, noting(tmp_path / "features.db", noted), 1) == ({1: noted} if is_open else {})
     assert ("hardly determine" in capsys.readouterr().out) == is_open
     held = with_focals(model, {1: noted}, 1)
     assert held.cameras[1].mean_focal_length() == noted and model.cameras[1].mean_focal_length() == focal
 
 
-def test_a_focal_length_near_that_of_exif_is_not_asked_for(capsys):
-    model = a_flight(0.0, 1.05 * TRUE)
-    assert not is_focal_open(model, {1: TRUE}, 1) and not is_focal_open(model, {}, 1)
+def test_a_focal_length_near_that_of_exif_is_not_asked_for(tmp_path, capsys):
+    assert open_focals(a_flight(0.0, 1.05 * TRUE), noting(tmp_path / "features.db", TRUE), 1) == {}
     assert "EXIF" not in capsys.readouterr().out
 
 
-def test_only_focal_lengths_of_exif_are_noted(tmp_path):
-    with pycolmap.Database.open(tmp_path / "features.db") as database:
-        for known in (True, False):
-            camera = pycolmap.Camera(params=[TRUE, 100, 80, 0.0], **LENS)
-            camera.has_prior_focal_length = known
-            database.write_camera(camera)
-    assert noted_focals(tmp_path / "features.db") == {1: TRUE}
+def test_only_focal_lengths_of_exif_are_noted(tmp_path, capsys):
+    model, database = a_flight(0.0, 1.3 * TRUE), noting(tmp_path / "features.db", TRUE, known=False)
+    assert open_focals(model, database, 1) == {} and "EXIF" not in capsys.readouterr().out
+    other = noting(noting(tmp_path / "two.db", TRUE), TRUE, known=False)
+    assert open_focals(model, other, 1) == {1: TRUE}
