@@ -197,7 +197,7 @@ def bake(
     mpis = BakedMpis(plan.mpis, intervals, *tables, density_codes, channels)
     numbers = [x.detach().cpu() for x in network.layers(0)]
     numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
-    shader = Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.direction_frequencies, MOST_CHANGE)
+    shader = Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.frequencies[0], MOST_CHANGE)
     farthest = 10 * max(m.farthest for m in plan.mpis)
     return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
 

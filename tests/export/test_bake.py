@@ -281,7 +281,7 @@ def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
         with pytest.raises(ValueError, match="shading ray"):
             model.baked(model.field)
     finally:
-        model.field._modules["networks"] = RayShader(4, 8, 2)
+        model.field._modules["networks"] = RayShader(1, 4, 8, 2)
 
 
 @pytest.mark.parametrize(
