@@ -113,26 +113,20 @@ def _scene(device: str, with_cube: bool, count: int = 2) -> tuple[SceneLayout, T
     return layout, Tables(_random(device, rows, 1) - 0.5, _random(device, rows, 1), touched)
 
 
-def _rays(device: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Origins, directions, nears and fars."""
-    origins = _random(device, RAYS, 3) * 0.4 - 0.2
-    directions = torch.cat([_random(device, RAYS, 2) - 0.5, torch.ones(RAYS, 1, device=device)], -1)
-    near = torch.full((RAYS, 1), 0.05, device=device)
-    return origins, torch.nn.functional.normalize(directions, dim=-1), near, torch.full_like(near, torch.inf)
-
-
 def _marches(device: str, shapes: Shapes) -> list[tuple]:
-    cases = []
+    cases, near = [], torch.full((RAYS, 1), 0.05, device=device)
+    ahead = torch.cat([_random(device, RAYS, 2) - 0.5, torch.ones(RAYS, 1, device=device)], -1)
+    directions = torch.nn.functional.normalize(ahead, dim=-1)
+    rays = Rays(_random(device, RAYS, 3) * 0.4 - 0.2, directions, near, torch.full_like(near, torch.inf))
     for mpis in shapes.mpis:
         some, every = MarchOptions(0.02 / max(mpis, 2)), MarchOptions(0.0)
         layout, tables = _scene(device, shapes.cube, mpis)
-        rays = Rays(*_rays(device))
         cases += [(layout, tables, rays, options) for options in (some, every)]
         if shapes.blends:
             cases.append((layout, tables, rays, some._replace(blends=True)))
             # Before that, each MPI answers rays of its own.
             for which in ((_random(device, RAYS, layout.num_heads) < 0.5, None), (None, _random(device, RAYS, mpis))):
-                cases.append((layout, tables, Rays(*_rays(device), *which), some))
+                cases.append((layout, tables, Rays(*rays[:4], *which), some))
     return cases
 
 

@@ -305,6 +305,8 @@ def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: March
 def _tiles(layout: SceneLayout) -> ctypes.Array:
     """The tiles of all MPIs from which something can be read, so that rays pass over the others: where the lower corner
     of four texels is in the tile, one of them is stored."""
+    if "tiles" in layout.packed:
+        return layout.packed["tiles"]
     columns, bricks, count = [torch.zeros(0, 2, dtype=torch.int32)], [torch.zeros(1, 4, dtype=torch.int32)], 0
     for grid in layout.grids[: len(layout.mpis)]:
         tiles = pad(grid.own_tiles, (0, 1, 0, 1))
@@ -314,12 +316,12 @@ def _tiles(layout: SceneLayout) -> ctypes.Array:
         columns.append(stored)
         bricks.append(corners[tuple(places.T)])
         count += len(places)
-    return structs((torch.cat(columns), torch.cat(bricks[1:] + bricks[:1])))
+    return layout.packed.setdefault("tiles", structs((torch.cat(columns), torch.cat(bricks[1:] + bricks[:1]))))
 
 
 @show_rays.on_cpu
 def show_rays_on_cpu(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
     walk = (layout.cpu_scene(tables), structs(dense_fields(rays)))
-    texels = (layout.once("tiles", _tiles), *dense(features), *features.shape)
+    texels = (_tiles(layout), *dense(features), *features.shape)
     how = (float(options.threshold), float(options.fair_share), options.blends)
     return shown("mmpi_show", len(rays.origins), features.shape[1], *walk, *texels, *how)
