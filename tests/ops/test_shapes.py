@@ -83,13 +83,8 @@ def walked():
     """Arguments of the march and of pictures: a layout, tables, features, rays and options."""
     layout, tables, rays, _ = trial._marches("cpu", SMALL)[0]
     heads, priorities = torch.ones(5, 3, dtype=torch.bool), torch.rand(5, 2)
-    return (
-        layout,
-        tables,
-        torch.zeros(len(tables.density), 4),
-        Rays(*(x[:5] for x in rays[:4]), heads, priorities),
-        MarchOptions(0.01),
-    )
+    rays = Rays(*(x[:5] for x in rays[:4]), heads, priorities)
+    return layout, tables, torch.zeros(len(tables.density), 4), rays, MarchOptions(0.01)
 
 
 @pytest.mark.parametrize("change", WIDER)
