@@ -25,7 +25,7 @@ from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.metrics import ImageMetrics, psnr
-from mmpi_ns.scene.baked import Codes, most_of_copies, neighbours
+from mmpi_ns.scene.baked import most_of_copies, neighbours
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order
@@ -119,12 +119,9 @@ def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
     mpis = window.mpis
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     most = most_of_copies(peaks, beside)
-
-    def smooth(channel: tuple[Tensor, Codes]) -> Tensor:
-        table, codes = channel
-        return smoothed_codes(table, (SLACK / codes.step / most).clamp(max=255).to(torch.uint8), beside)
-
-    texels = list(in_order(smooth, zip(mpis.texels.unbind(-1), mpis.channel_codes, strict=True)))
+    slacks = [(SLACK / codes.step / most).clamp(max=255).to(torch.uint8) for codes in mpis.channel_codes]
+    channels = zip(mpis.texels.unbind(-1), slacks, strict=True)
+    texels = list(in_order(lambda channel: smoothed_codes(*channel, beside), channels))
     return replace(window, mpis=replace(mpis, texels=torch.stack(texels, -1), packed={}))
 
 

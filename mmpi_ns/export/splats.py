@@ -172,19 +172,16 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
         keys[numbers[plane, row, column].to(torch.int64)] = torch.where((y < mpi.height) & (x < mpi.width), key, -1)
     inside = keys.flatten() >= 0
     texels, flat = keys.flatten()[inside].unique(return_inverse=True)
-
-    def gather(values: Tensor) -> Tensor:
-        return values.new_zeros(len(texels), *values.shape[1:]).index_copy(0, flat, values[inside])
-
+    codes = torch.cat([mpis.density[..., None], mpis.texels], -1).flatten(0, 2)[inside]
+    codes = codes.new_zeros(len(texels), codes.shape[1]).index_copy(0, flat, codes).float()
     head = torch.searchsorted(starts, texels, right=True) - 1
     place, (_, height, width) = texels - starts[head], sizes[head].unbind(-1)
     places = torch.stack([head, place // (height * width), place // width % height, place % width], -1)
-    codes = gather(mpis.density.flatten()).float()
-    depths = torch.empty_like(codes)
+    depths = torch.empty(len(texels))
     for k in range(len(mpis.mpis)):
-        depths[head == k] = mpis.optical_depth(k, codes[head == k])
+        depths[head == k] = mpis.optical_depth(k, codes[head == k, 0])
     low, step = (torch.tensor([getattr(c, name) for c in mpis.channel_codes]) for name in ("low", "step"))
-    channels = activate(low + step * gather(mpis.texels.flatten(0, 2)).float())
+    channels = activate(low + step * codes[:, 1:])
     highest = torch.zeros(len(texels)).scatter_reduce(0, flat, peaks.flatten()[inside], "amax")
     return _Texels(places, -torch.expm1(-depths), depths, channels, highest)
 
@@ -219,14 +216,12 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
     inside = (group >= 0).nonzero()[:, 0]
     group, level, total = group[inside], level[inside], int(group.max()) + 1
     count = torch.bincount(group, minlength=total).float()
-
-    def mean(values: Tensor) -> Tensor:
-        return torch.zeros(total, values.shape[1]).index_add(0, group, values[inside].float()) / count[:, None]
-
+    values = torch.cat([texels.places[:, 2:].float(), texels.depths[:, None], texels.channels[:, :COLORS]], -1)[inside]
+    average = torch.zeros(total, values.shape[1]).index_add(0, group, values) / count[:, None]
+    (y, x, depth), colors = average[:, :3].unbind(-1), average[:, 3:]
     first = torch.empty_like(count, dtype=torch.int64).index_copy(0, group, inside)
     head, plane = texels.places[first, :2].unbind(-1)
     size = 2.0 ** torch.empty_like(first).index_copy(0, group, level)
-    (y, x), depth = mean(texels.places[:, 2:]).unbind(-1), mean(texels.depths[:, None])[:, 0]
     means, scales = torch.empty(total, 3), torch.empty(total, 3)
     rotations, alphas = torch.empty(total, 4), torch.empty(total)
     for k, mpi in enumerate(window.mpis.mpis):
@@ -244,7 +239,7 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
         # Overlapping splats of this spacing sum to this multiple of their centre value, after a rasteriser's blur.
         overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
         alphas[in_mpi] = -torch.expm1(-DENSER * depth[in_mpi] / overlap)
-    colors = torch.cat([mean(texels.channels[:, :COLORS])[:, None], torch.zeros(total, 3, COLORS)], 1)
+    colors = torch.cat([colors[:, None], torch.zeros(total, 3, COLORS)], 1)
     return Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
 
 
