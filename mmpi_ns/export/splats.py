@@ -76,10 +76,6 @@ class Splats:
         directions = torch.nn.functional.normalize(self.means - eye, dim=-1)
         return torch.cat([torch.ones_like(directions[:, :1]), directions], -1)
 
-    def seen_from(self, eye: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
-        """Colours of all splats, seen from a point."""
-        return (self.basis(eye)[:, :, None] * self.colors).sum(1).clamp(0, 1)
-
 
 @dataclass(frozen=True)
 class _Texels:
@@ -141,7 +137,7 @@ def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats
 
     def errors_in(pose: Pose) -> tuple[View, Tensor]:
         view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-        colors = splats.seen_from(view.to_world[:, 3])
+        colors = (splats.basis(view.to_world[:, 3])[:, :, None] * splats.colors).sum(1).clamp(0, 1)
         image = splat_image(gaussians, view, colors)
         shown = image[..., :3] + window.background * image[..., 3:]
         missing = window.render(*pose.rays())["rgb"].view(shown.shape) - shown
@@ -228,7 +224,7 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
         in_mpi = head == k
         u0, u1, v0, v1 = mpi.extent
         du, dv = (u1 - u0) / (mpi.width - 1), (v1 - v0) / (mpi.height - 1)
-        disparity = (mpi.planes - 1 - plane[in_mpi]) * mpi.disparity_step + mpi.last_disparity
+        disparity = (mpi.planes - 1 - plane[in_mpi]) * mpi.disparity_step + 1 / mpi.far
         z = 1 / disparity.clamp(min=1 / window.farthest)
         local = torch.stack([(u0 + x[in_mpi] * du) * z, (v0 + y[in_mpi] * dv) * z, z], -1)
         means[in_mpi] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)

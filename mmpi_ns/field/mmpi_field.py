@@ -113,7 +113,7 @@ class MMPIField(TexelTables):
             return layout
         mpis, device, cube, biases = self.plan.mpis, self.density.device, self.plan.cube, []
         for m in mpis:
-            missing = m.last_disparity / m.disparity_step
+            missing = 1 / m.far / m.disparity_step
             alpha = (1.0 / (m.planes + missing - torch.arange(m.planes, dtype=torch.float64))).clamp(max=0.999)
             raw = torch.log(torch.expm1(-torch.log1p(-alpha) / (256.0 / m.planes)))
             biases.append(raw.float().to(device))
@@ -134,8 +134,10 @@ class MMPIField(TexelTables):
     @property
     def nbytes(self) -> int:
         """Bytes of its tables, and of its bricks if it is baked."""
-        bricks = self.cached("baked")
-        return sum(x.nbytes for x in self.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
+        tables = [*self.state_dict().values()]
+        if (baked := self.cached("baked")) is not None:
+            tables += [baked.mpis.columns, baked.mpis.density, baked.mpis.texels]
+        return sum(x.nbytes for x in tables)
 
     def forget_baked(self) -> None:
         """Drops the baked window, because the field is about to be trained."""

@@ -68,7 +68,7 @@ class Operation(Generic[P, R]):
         _OPERATIONS[self.name] = self
         if in_cpp is not None:
             self.hints, self.least = get_type_hints(reference), in_cpp
-            self.on_cpu(self._in_cpp)
+            self.on_cpu(functools.update_wrapper(functools.partial(self._in_cpp), reference))
 
     def on_cpu(self, form: Callable[P, R]) -> Callable[P, R]:
         """Makes a function the form for a CPU."""

@@ -253,7 +253,7 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
             tangents = u0 + x / (grid.width - 1) * (u1 - u0), v0 + y / (grid.height - 1) * (v1 - v0)
             # Rays from the MPI's own origin, to keep precision far from the world's.
             directions = geometry.rotate(frames.axes[k].T, torch.stack([*tangents, torch.ones_like(x)], -1))
-            disparity = (mpi.planes - 1 - plane) * mpi.disparity_step + mpi.last_disparity
+            disparity = (mpi.planes - 1 - plane) * mpi.disparity_step + 1 / mpi.far
             local = geometry.LocalRays.of(frames.origins[k].expand_as(directions), directions, frames)
             numbers = torch.arange(len(part), device=part.device)
             samples = (numbers, local, disparity, torch.full_like(numbers, k))

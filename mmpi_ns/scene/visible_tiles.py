@@ -121,7 +121,7 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[
         along.append((slope[..., None, None] * tangents).amax(-2).to(device))
     along_x, along_y = along
     shift, ahead = (normals * origins[:, None]).sum(-1), normals[..., 2]
-    w = mpi.last_disparity + torch.arange(mpi.planes - 1, -1, -1, dtype=torch.float64) * mpi.disparity_step
+    w = 1 / mpi.far + torch.arange(mpi.planes - 1, -1, -1, dtype=torch.float64) * mpi.disparity_step
     rest = ahead - w[:, None, None] * shift
     rest[w[:, None] * origins[:, 2] >= 1] = -torch.inf  # cameras that a plane lies behind
     rest = rest.to(device)

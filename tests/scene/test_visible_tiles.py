@@ -105,7 +105,7 @@ def test_planes_that_every_camera_has_passed_are_out_of_reach():
     shot.camera_to_worlds[:, :, 3] = torch.tensor([0.0, 0.0, 2.0])
     found = reachable_tiles(TrainingViews.of(shot), ScenePlan((mpi,), None, 0.05, 1.0))
     steps = torch.arange(mpi.planes - 1, -1, -1)
-    depths = 1 / (mpi.last_disparity + steps * mpi.disparity_step)
+    depths = 1 / (1 / mpi.far + steps * mpi.disparity_step)
     ahead = found.view(mpi.planes, -1).any(1)
     assert (depths < 2).any() and torch.equal(ahead, depths > 2)
 

@@ -166,7 +166,7 @@ def _live_samples(
             u0, u1, v0, v1 = mpi.extent
             u = (ray[:, 0] + w * ray[:, 1] - u0) * (2 / (u1 - u0)) - 1
             v = (ray[:, 2] + w * ray[:, 3] - v0) * (2 / (v1 - v0)) - 1
-            ndc = torch.stack([u, v, 1 - 2 * mpi.near / mpi.depth_share * (w - mpi.last_disparity)], -1)
+            ndc = torch.stack([u, v, 1 - 2 * mpi.near / mpi.depth_share * (w - 1 / mpi.far)], -1)
             planes, inverse_t = mpi.planes - 1 - m, inverse_distance(w, ray[:, 4], ray[:, 5])
             texels = grid.bilinear(planes, ndc)
         else:
