@@ -101,7 +101,7 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         most: maximum number of splats; those with the least weight are left out.
         rounds: of fitting colours to renderings of the window.
     """
-    texels = _texels(window, window.peaks(poses, Pose.rays))
+    texels = _texels(window, window.peaks(pose.rays() for pose in poses))
     group, level = _merged(texels, texels.peaks >= least)
     is_seen = group >= 0
     weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[is_seen], texels.peaks[is_seen], "amax")

@@ -6,9 +6,8 @@ resulting share depends on the position alone, so a baked texel stores the optic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,8 +34,6 @@ from mmpi_ns.scene.baked import (
 )
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
-
-Item = TypeVar("Item")
 
 THINNEST = -12.0
 """Lower bound on the raw density of code 0; its softplus is 6e-6."""
@@ -109,18 +106,12 @@ class BakedWindow:
         nears = torch.full_like(origins[:, :1], self.ray_near)
         return nears, torch.full_like(nears, torch.inf)
 
-    def peaks(
-        self, views: Sequence[Item], rays_of: Callable[[Item], tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]
-    ) -> Float[Tensor, "B 8 8"]:
-        """Largest weight of any sample of some views in each texel.
-
-        Args:
-            views: whatever ``rays_of`` takes.
-            rays_of: origins and unit directions of a view's rays.
-        """
+    def peaks(self, views: Iterable[tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]) -> Float[Tensor, "B 8 8"]:
+        """Largest weight of any sample of some views, given by origins and unit directions of their rays, in each
+        texel."""
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
-            for o, d in zip(*(x.split(AT_ONCE) for x in rays_of(view)), strict=True):
+            for o, d in zip(*(x.split(AT_ONCE) for x in view), strict=True):
                 show_baked(self.mpis, Rays(o, d, *self.unbounded(o)), self.threshold, peaks)
         return peaks
 
