@@ -116,7 +116,7 @@ class Operation(Generic[P, R]):
                 passed.append(hints[name](value))
                 continue
             if is_group:
-                tensors, owner = value._asdict(), type(value)
+                tensors, owner = cast(Any, value)._asdict(), type(value)
             for part, tensor in tensors.items():
                 shape, kind = annotated(owner)[part]
                 if tensor.dtype != kind:
