@@ -97,7 +97,7 @@ def _density_constants(field, k):
     if k < len(field.plan.mpis):
         planes = field.plan.mpis[k].planes
         alphas, interval = np.minimum(1 / np.arange(planes, 0, -1), 0.999), 256 / planes
-        return interval * field.depth_scale, np.log((1 - alphas) ** (-1 / interval) - 1)
+        return interval * field.layout.depth_scale, np.log((1 - alphas) ** (-1 / interval) - 1)
     interval = 1 / field.samples_per_voxel
     return interval, np.full(field.grids[k].depth, math.log((1 - field.cube_alpha) ** (-1 / interval) - 1))
 
@@ -118,7 +118,7 @@ def _color(networks, k, features, ndc, direction):
     for shape in networks.shapes:
         layers.append(flat[start : start + math.prod(shape)].reshape(shape))
         start += math.prod(shape)
-    x = [features, _encode(ndc, networks.position_frequencies), _encode(direction, networks.direction_frequencies)]
+    x = [features, *(_encode(v, n) for v, n in zip((ndc, direction), networks.frequencies, strict=True))]
     hidden = np.maximum(layers[0] @ np.concatenate(x) + layers[1], 0)
     hidden = np.maximum(layers[2] @ hidden + layers[3], 0)
     return 1 / (1 + np.exp(-(features[:3] + layers[4] @ hidden + layers[5])))

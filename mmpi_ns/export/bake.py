@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -25,7 +24,7 @@ from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.metrics import ImageMetrics, psnr
-from mmpi_ns.scene.baked import Codes, most_of_copies, neighbours
+from mmpi_ns.scene.baked import most_of_copies, neighbours
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order
@@ -79,11 +78,6 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
     shares = (
         window_shares(cameras.camera_to_worlds[:, :, 3], places) if len(places) > 1 else torch.ones(len(cameras), 1)
     )
-
-    def rays_of(step: int, i: int) -> tuple[Tensor, Tensor]:
-        rays = image_rays(cameras[i : i + 1], step).flatten()
-        return rays.origins.contiguous(), rays.directions.contiguous()
-
     views, nearest = (), 0
     if (details := model.details) is not None:
         read, nearest = details.view, model.config.rendering.nearest_images
@@ -97,7 +91,8 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         cameras_here = (shares[:, number] > 0).nonzero()[:, 0].tolist()
         step = math.ceil((float((cameras.width * cameras.height)[cameras_here].sum()) / MOST_LOOKED_AT) ** 0.5)
         alike = sorted(cameras_here, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
-        peaks = whole.peaks(alike, partial(rays_of, step))
+        rays = (image_rays(cameras[i : i + 1], step).flatten() for i in alike)
+        peaks = whole.peaks((each.origins, each.directions) for each in rays)
         seen = peaks.amax((1, 2)) >= least
         kept = smoothed(replace(whole, seen=peaks.sum((1, 2))).keep(seen), peaks[seen])
         print(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen.")
@@ -119,12 +114,9 @@ def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
     mpis = window.mpis
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     most = most_of_copies(peaks, beside)
-
-    def smooth(channel: tuple[Tensor, Codes]) -> Tensor:
-        table, codes = channel
-        return smoothed_codes(table, (SLACK / codes.step / most).clamp(max=255).to(torch.uint8), beside)
-
-    texels = list(in_order(smooth, zip(mpis.texels.unbind(-1), mpis.channel_codes, strict=True)))
+    slacks = [(SLACK / codes.step / most).clamp(max=255).to(torch.uint8) for codes in mpis.channel_codes]
+    channels = zip(mpis.texels.unbind(-1), slacks, strict=True)
+    texels = list(in_order(lambda channel: smoothed_codes(*channel, beside), channels))
     return replace(window, mpis=replace(mpis, texels=torch.stack(texels, -1), packed={}))
 
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
-from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -81,13 +79,11 @@ def restored_view(view: StoredView, device: torch.device) -> DetailView:
         OSError: an image is damaged.
     """
     width, height = view.size
-    codes = torch.from_numpy(_pixels(view.inverse)[..., 0].copy()).float()
-    codes = interpolate(codes[None, None], (height, width), mode="bilinear", align_corners=False)[0, 0]
+    depths, colours = (
+        torch.from_numpy(np.array(Image.open(io.BytesIO(data)).convert("RGB"))).float()
+        for data in (view.inverse, view.difference)
+    )
+    codes = interpolate(depths[None, None, ..., 0], (height, width), mode="bilinear", align_corners=False)[0, 0]
     inverse = view.most * ((codes - 1).clamp(min=0) / 254).square()
-    difference = STEP * (torch.from_numpy(_pixels(view.difference).copy()).float() - ZERO)
-    image = torch.cat([difference, torch.where(codes < 0.5, -1.0, inverse)[..., None]], -1)
+    image = torch.cat([STEP * (colours - ZERO), torch.where(codes < 0.5, -1.0, inverse)[..., None]], -1)
     return DetailView(image.to(device), torch.tensor(view.camera, device=device))
-
-
-def _pixels(data: bytes) -> UInt8[NDArray[np.uint8], "H W 3"]:
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))

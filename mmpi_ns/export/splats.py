@@ -76,10 +76,6 @@ class Splats:
         directions = torch.nn.functional.normalize(self.means - eye, dim=-1)
         return torch.cat([torch.ones_like(directions[:, :1]), directions], -1)
 
-    def seen_from(self, eye: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
-        """Colours of all splats, seen from a point."""
-        return (self.basis(eye)[:, :, None] * self.colors).sum(1).clamp(0, 1)
-
 
 @dataclass(frozen=True)
 class _Texels:
@@ -105,7 +101,7 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         most: maximum number of splats; those with the least weight are left out.
         rounds: of fitting colours to renderings of the window.
     """
-    texels = _texels(window, window.peaks(poses, Pose.rays))
+    texels = _texels(window, window.peaks(pose.rays() for pose in poses))
     group, level = _merged(texels, texels.peaks >= least)
     is_seen = group >= 0
     weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[is_seen], texels.peaks[is_seen], "amax")
@@ -141,7 +137,7 @@ def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats
 
     def errors_in(pose: Pose) -> tuple[View, Tensor]:
         view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-        colors = splats.seen_from(view.to_world[:, 3])
+        colors = (splats.basis(view.to_world[:, 3])[:, :, None] * splats.colors).sum(1).clamp(0, 1)
         image = splat_image(gaussians, view, colors)
         shown = image[..., :3] + window.background * image[..., 3:]
         missing = window.render(*pose.rays())["rgb"].view(shown.shape) - shown
@@ -172,19 +168,16 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
         keys[numbers[plane, row, column].to(torch.int64)] = torch.where((y < mpi.height) & (x < mpi.width), key, -1)
     inside = keys.flatten() >= 0
     texels, flat = keys.flatten()[inside].unique(return_inverse=True)
-
-    def gather(values: Tensor) -> Tensor:
-        return values.new_zeros(len(texels), *values.shape[1:]).index_copy(0, flat, values[inside])
-
+    codes = torch.cat([mpis.density[..., None], mpis.texels], -1).flatten(0, 2)[inside]
+    codes = codes.new_zeros(len(texels), codes.shape[1]).index_copy(0, flat, codes).float()
     head = torch.searchsorted(starts, texels, right=True) - 1
     place, (_, height, width) = texels - starts[head], sizes[head].unbind(-1)
     places = torch.stack([head, place // (height * width), place // width % height, place % width], -1)
-    codes = gather(mpis.density.flatten()).float()
-    depths = torch.empty_like(codes)
+    depths = torch.empty(len(texels))
     for k in range(len(mpis.mpis)):
-        depths[head == k] = mpis.optical_depth(k, codes[head == k])
+        depths[head == k] = mpis.optical_depth(k, codes[head == k, 0])
     low, step = (torch.tensor([getattr(c, name) for c in mpis.channel_codes]) for name in ("low", "step"))
-    channels = activate(low + step * gather(mpis.texels.flatten(0, 2)).float())
+    channels = activate(low + step * codes[:, 1:])
     highest = torch.zeros(len(texels)).scatter_reduce(0, flat, peaks.flatten()[inside], "amax")
     return _Texels(places, -torch.expm1(-depths), depths, channels, highest)
 
@@ -219,21 +212,19 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
     inside = (group >= 0).nonzero()[:, 0]
     group, level, total = group[inside], level[inside], int(group.max()) + 1
     count = torch.bincount(group, minlength=total).float()
-
-    def mean(values: Tensor) -> Tensor:
-        return torch.zeros(total, values.shape[1]).index_add(0, group, values[inside].float()) / count[:, None]
-
+    values = torch.cat([texels.places[:, 2:].float(), texels.depths[:, None], texels.channels[:, :COLORS]], -1)[inside]
+    average = torch.zeros(total, values.shape[1]).index_add(0, group, values) / count[:, None]
+    (y, x, depth), colors = average[:, :3].unbind(-1), average[:, 3:]
     first = torch.empty_like(count, dtype=torch.int64).index_copy(0, group, inside)
     head, plane = texels.places[first, :2].unbind(-1)
     size = 2.0 ** torch.empty_like(first).index_copy(0, group, level)
-    (y, x), depth = mean(texels.places[:, 2:]).unbind(-1), mean(texels.depths[:, None])[:, 0]
     means, scales = torch.empty(total, 3), torch.empty(total, 3)
     rotations, alphas = torch.empty(total, 4), torch.empty(total)
     for k, mpi in enumerate(window.mpis.mpis):
         in_mpi = head == k
         u0, u1, v0, v1 = mpi.extent
         du, dv = (u1 - u0) / (mpi.width - 1), (v1 - v0) / (mpi.height - 1)
-        disparity = (mpi.planes - 1 - plane[in_mpi]) * mpi.disparity_step + mpi.last_disparity
+        disparity = (mpi.planes - 1 - plane[in_mpi]) * mpi.disparity_step + 1 / mpi.far
         z = 1 / disparity.clamp(min=1 / window.farthest)
         local = torch.stack([(u0 + x[in_mpi] * du) * z, (v0 + y[in_mpi] * dv) * z, z], -1)
         means[in_mpi] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)
@@ -244,7 +235,7 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
         # Overlapping splats of this spacing sum to this multiple of their centre value, after a rasteriser's blur.
         overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
         alphas[in_mpi] = -torch.expm1(-DENSER * depth[in_mpi] / overlap)
-    colors = torch.cat([mean(texels.channels[:, :COLORS])[:, None], torch.zeros(total, 3, COLORS)], 1)
+    colors = torch.cat([colors[:, None], torch.zeros(total, 3, COLORS)], 1)
     return Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
 
 

@@ -32,18 +32,6 @@ from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.visible_tiles import TrainingViews
 
 
-def plane_biases(planes: int, missing: float) -> Float[Tensor, "L"]:
-    """Density biases b_l with which all planes start at equal rendering weight 1/L.
-
-    alpha_l = 1 / (L - l), the last one clamped; alpha = 1 - exp(-softplus(b) 256 / L) solved for b.
-    An MPI with a finite far starts like one to infinity without its last ``missing`` planes, alpha_l =
-    1 / (L + missing - l): their share of the weight is left to content behind it.
-    Source: DVGO v2's MPI; docs/how_it_works.md, "Density".
-    """
-    alpha = (1.0 / (planes + missing - torch.arange(planes, dtype=torch.float64))).clamp(max=0.999)
-    return torch.log(torch.expm1(-torch.log1p(-alpha) / (256.0 / planes))).float()
-
-
 @dataclass
 class ColourConfig:
     """Features and networks of colours: ``--pipeline.model.colour.*``."""
@@ -97,11 +85,11 @@ class MMPIField(TexelTables):
         """Whether training rays mark the texels they train. Only blending needs the marks; once it has begun none are
         added, so that P cannot jump."""
         self.shading = shading
+        sizes = (feature_channels, hidden_width)
         if shading == "ray":
-            self.networks = RayShader(feature_channels, hidden_width, direction_frequencies)
+            self.networks = RayShader(1, *sizes, direction_frequencies)
         else:
-            sizes = (feature_channels, hidden_width, position_frequencies, direction_frequencies)
-            self.networks = ColorNetworks(plan.num_heads, *sizes)
+            self.networks = ColorNetworks(plan.num_heads, *sizes, position_frequencies, direction_frequencies)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes the number of colour networks from the checkpoint first."""
@@ -114,16 +102,28 @@ class MMPIField(TexelTables):
 
     @property
     def layout(self) -> SceneLayout:
-        """The plan's constants at the resolution in use, on the parameters' device."""
+        """The plan's constants at the resolution in use, on the parameters' device.
+
+        All planes start at equal rendering weight 1/L: biases b_l give alpha_l = 1 / (L - l), the last one clamped, by
+        alpha = 1 - exp(-softplus(b) 256 / L). An MPI with a finite far starts like one to infinity without its last
+        planes, whose share of the weight is left to content behind it. Source: DVGO v2's MPI; docs/how_it_works.md,
+        "Density".
+        """
         if (layout := self.cached("layout")) is not None:
             return layout
-        mpis, device, cube = self.plan.mpis, self.density.device, self.plan.cube
+        mpis, device, cube, biases = self.plan.mpis, self.density.device, self.plan.cube, []
+        for m in mpis:
+            missing = 1 / m.far / m.disparity_step
+            alpha = (1.0 / (m.planes + missing - torch.arange(m.planes, dtype=torch.float64))).clamp(max=0.999)
+            raw = torch.log(torch.expm1(-torch.log1p(-alpha) / (256.0 / m.planes)))
+            biases.append(raw.float().to(device))
         frames = geometry.Frames.pack(mpis, device=device)
-        biases = [plane_biases(m.planes, m.last_disparity / m.disparity_step).to(device) for m in mpis]
         packed = None if cube is None else geometry.Cube.pack(cube, self.samples_per_voxel, device=device)
         interval = 1.0 / self.samples_per_voxel
         bias = math.log(math.expm1(-math.log1p(-self.cube_alpha) / interval))
-        depths = (biases, self.depth_scale, packed, bias, interval)
+        # From the current plan: that of a checkpoint has its own K.
+        scale = 1.0 / len(self.full_plan.mpis) if self.shares_depth else 1.0
+        depths = (biases, scale, packed, bias, interval)
         return self.cached("layout", lambda: SceneLayout(mpis, frames, self.grids, *depths, self.plan.content_near))
 
     @property
@@ -132,15 +132,12 @@ class MMPIField(TexelTables):
         return Tables(self.density.data, self.reliability.data, self.touched)
 
     @property
-    def depth_scale(self) -> float:
-        """Factor on every optical depth of an MPI, from the current plan: that of a checkpoint has its own K."""
-        return 1.0 / len(self.full_plan.mpis) if self.shares_depth else 1.0
-
-    @property
     def nbytes(self) -> int:
         """Bytes of its tables, and of its bricks if it is baked."""
-        bricks = self.cached("baked")
-        return sum(x.nbytes for x in self.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
+        tables = [*self.state_dict().values()]
+        if (baked := self.cached("baked")) is not None:
+            tables += [baked.mpis.columns, baked.mpis.density, baked.mpis.texels]
+        return sum(x.nbytes for x in tables)
 
     def forget_baked(self) -> None:
         """Drops the baked window, because the field is about to be trained."""

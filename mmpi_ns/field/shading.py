@@ -34,11 +34,18 @@ class Networks(nn.Module):
     """``count`` networks of two hidden layers, inputs -> three numbers, in one pooled parameter.
 
     Their last layer starts at zero, so the tables learn at their own rate from the first step.
+
+    Args:
+        count: of the networks.
+        channels: of a texel: three of the diffuse colour, the others features.
+        width: of the hidden layers.
+        frequencies: octaves of the positional encodings of what follows the channels; of directions last.
     """
 
-    def __init__(self, count: int, inputs: int, width: int) -> None:
+    def __init__(self, count: int, channels: int, width: int, *frequencies: int) -> None:
         super().__init__()
-        self.width = width
+        self.width, self.frequencies = width, frequencies
+        inputs = channels + sum(3 * (1 + 2 * octaves) for octaves in frequencies)
         self.shapes = [(width, inputs), (width,), (width, width), (width,), (3, width), (3,)]
         self.weights = nn.Parameter(torch.empty(0, sum(math.prod(s) for s in self.shapes)))
         self.resize(count)
@@ -64,30 +71,14 @@ class ColorNetworks(Networks):
     The first three features are colour logits, to which the network adds the view-dependent part.
     """
 
-    def __init__(self, count: int, channels: int, width: int, position_frequencies: int, direction_frequencies: int):
-        inputs = channels + 3 * (1 + 2 * position_frequencies) + 3 * (1 + 2 * direction_frequencies)
-        super().__init__(count, inputs, width)
-        self.position_frequencies, self.direction_frequencies = position_frequencies, direction_frequencies
-
     def of_heads(self, numbers: Sequence[int]) -> SampleNetworks:
         """Networks of heads, given the number of each head's network."""
-        return SampleNetworks(
-            tuple(self.layers(k) for k in numbers), self.position_frequencies, self.direction_frequencies
-        )
+        return SampleNetworks(tuple(self.layers(k) for k in numbers), *self.frequencies)
 
 
 class RayShader(Networks):
-    """One network (colour, features, PE(direction)) -> view-dependent change of the composited colour of a ray.
-
-    Args:
-        channels: of a texel: three of the diffuse colour, the others features.
-        width: of the hidden layers.
-        direction_frequencies: octaves of the positional encoding of directions in world axes.
-    """
-
-    def __init__(self, channels: int, width: int, direction_frequencies: int) -> None:
-        super().__init__(1, channels + 3 * (1 + 2 * direction_frequencies), width)
-        self.direction_frequencies = direction_frequencies
+    """One network (colour, features, PE(direction in world axes)) -> view-dependent change of the composited colour of
+    a ray."""
 
     def shade(
         self,
@@ -105,7 +96,7 @@ class RayShader(Networks):
             directions: unit, world axes.
         """
         mean = gathered / mass.clamp(min=LEAST_MASS)
-        encoded = positional_encoding(directions, self.direction_frequencies)
+        encoded = positional_encoding(directions, self.frequencies[0])
         said = run_layers(self.layers(0), torch.cat([mean, encoded], -1))
         return accumulation * change_odds(mean[:, :COLORS], said)
 

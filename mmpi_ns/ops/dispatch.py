@@ -56,12 +56,19 @@ class Operation(Generic[P, R]):
     """
 
     def __init__(
-        self, reference: Callable[P, R], compiled: tuple[Form, ...], check: Callable[..., None] | None
+        self,
+        reference: Callable[P, R],
+        compiled: tuple[Form, ...],
+        check: Callable[..., None] | None,
+        in_cpp: int | None,
     ) -> None:
         functools.update_wrapper(self, reference)
         self.reference, self.compiled, self.check = reference, list(compiled), check
         self.name, self.signature = reference.__name__, inspect.signature(reference)
         _OPERATIONS[self.name] = self
+        if in_cpp is not None:
+            self.hints, self.least = get_type_hints(reference), in_cpp
+            self.on_cpu(functools.update_wrapper(functools.partial(self._in_cpp), reference))
 
     def on_cpu(self, form: Callable[P, R]) -> Callable[P, R]:
         """Makes a function the form for a CPU."""
@@ -95,6 +102,33 @@ class Operation(Generic[P, R]):
             _faults[self.name] = _say(reason, f"Plain torch for {self.name}")
             return function(self.name, "reference")(*values)
 
+    def _in_cpp(self, *values: Any) -> Any:
+        """``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ as the form for a CPU.
+
+        Arguments are those of the definition, a named tuple's fields one by one; sizes what the letters in their
+        annotations stand for, in the order in which they occur; results the tensor, or those of the named tuple, that
+        it returns. Tensors of another type than annotated (int64 and float32, unless it names one) take the definition.
+        """
+        hints, forms, least, sizes, passed = self.hints, annotated(self.reference), self.least, {}, []
+        for name, value in zip(self.signature.parameters, values, strict=True):
+            is_group, tensors, owner = hasattr(value, "_asdict"), {name: value}, self.reference
+            if not is_group and not isinstance(value, Tensor):
+                passed.append(hints[name](value))
+                continue
+            if is_group:
+                tensors, owner = cast(Any, value)._asdict(), type(value)
+            for part, tensor in tensors.items():
+                shape, kind = annotated(owner)[part]
+                if tensor.dtype != kind:
+                    return cast(Any, self.reference)(*values)
+                sizes |= {letter: n for letter, n in zip(shape, tensor.shape, strict=True) if isinstance(letter, str)}
+                passed.append(tensor.contiguous())
+        columns = [forms["return"]] if "return" in forms else annotated(hints["return"]).values()
+        results = [torch.empty([sizes.get(n, n) for n in shape], dtype=kind) for shape, kind in columns]
+        parts = len(results[0]) if least else [0, len(results[0])]
+        build.call_in_parts(f"mmpi_{self.name}", parts, *passed, *sizes.values(), *results, least=least)
+        return results[0] if "return" in forms else hints["return"](*results)
+
 
 _OPERATIONS: dict[str, Operation[..., Any]] = {}
 
@@ -107,51 +141,10 @@ def operation(
     Args:
         compiled: the forms in modules beside it.
         check: takes the same arguments and raises what their annotations cannot say.
-        in_cpp: the form for a CPU is ``mmpi_NAME`` in C++ (``_in_cpp``); rows of its first result that are worth
-            another thread, 0: one thread computes all.
+        in_cpp: the form for a CPU is ``mmpi_NAME`` in C++ (``Operation._in_cpp``); rows of its first result that are
+            worth another thread, 0: one thread computes all.
     """
-
-    def make(reference: Callable[P, R]) -> Operation[P, R]:
-        of = Operation(reference, compiled, check)
-        if in_cpp is not None:
-            of.on_cpu(_in_cpp(of, in_cpp))
-        return of
-
-    return make
-
-
-def _in_cpp(of: Operation[..., Any], least: int) -> Any:
-    """``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ as a form of an operation.
-
-    Arguments are those of the definition, a named tuple's fields one by one; sizes what the letters in their
-    annotations stand for, in the order in which they occur; results the tensor, or those of the named tuple, that it
-    returns. Tensors of another type than annotated (int64 and float32, unless it names one) take the definition.
-    """
-    hints, forms = get_type_hints(of.reference), annotated(of.reference)
-
-    @functools.wraps(of.reference)
-    def form(*values: Any) -> Any:
-        sizes, passed = {}, []
-        for name, value in zip(of.signature.parameters, values, strict=True):
-            is_group, tensors, owner = hasattr(value, "_asdict"), {name: value}, of.reference
-            if not is_group and not isinstance(value, Tensor):
-                passed.append(hints[name](value))
-                continue
-            if is_group:
-                tensors, owner = cast(Any, value)._asdict(), type(value)
-            for part, tensor in tensors.items():
-                shape, kind = annotated(owner)[part]
-                if tensor.dtype != kind:
-                    return of.reference(*values)
-                sizes |= {letter: n for letter, n in zip(shape, tensor.shape, strict=True) if isinstance(letter, str)}
-                passed.append(tensor.contiguous())
-        columns = [forms["return"]] if "return" in forms else annotated(hints["return"]).values()
-        results = [torch.empty([sizes.get(n, n) for n in shape], dtype=kind) for shape, kind in columns]
-        parts = len(results[0]) if least else [0, len(results[0])]
-        build.call_in_parts(f"mmpi_{of.name}", parts, *passed, *sizes.values(), *results, least=least)
-        return results[0] if "return" in forms else hints["return"](*results)
-
-    return form
+    return functools.partial(Operation, compiled=compiled, check=check, in_cpp=in_cpp)
 
 
 @functools.cache

@@ -29,10 +29,8 @@ BRICK_OF_TILE, TILE_OF_BRICK, INTS = map(tl.constexpr, range(7, 10))
 def grids_of(layout: SceneLayout) -> Int[Tensor, "N"]:
     """Where the texels of every head are, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
     brick of every tile and the tile of every brick."""
-    return layout.once("gpu", _pack)
-
-
-def _pack(layout: SceneLayout) -> Tensor:
+    if "gpu" in layout.packed:
+        return layout.packed["gpu"]
     device, grids, start = layout.frames.origins.device, layout.grids, layout.num_heads * INTS.value
     tiles, places = grids[0].tiles, grids[0].places
     rows = [
@@ -40,7 +38,8 @@ def _pack(layout: SceneLayout) -> Tensor:
         for g, b in zip(grids, layout.bias_starts(), strict=True)
     ]
     head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
-    return torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
+    packed = torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
+    return layout.packed.setdefault("gpu", packed)
 
 
 def block_size(size: int, device: torch.device) -> int:

@@ -60,16 +60,12 @@ class SceneLayout:
     content_near: float = 0.0
     """Distance to the first content."""
     packed: dict[str, Any] = field(default_factory=dict)
-    """The same in the layout of the compiled operations, made by them once."""
+    """The same in the layout of the compiled operations, made by them once. Where threads make it at once the first
+    one's stays (``setdefault``): compiled operations hold addresses in it."""
 
     @property
     def num_heads(self) -> int:
         return len(self.grids)
-
-    def once(self, name: str, make: Callable[[SceneLayout], Any]) -> Any:
-        """What ``make`` makes of the layout, made at first use."""
-        # Where threads make it at once the first one's stays: compiled operations hold addresses in it.
-        return self.packed[name] if name in self.packed else self.packed.setdefault(name, make(self))
 
     @property
     def sizes(self) -> dict[str, int]:

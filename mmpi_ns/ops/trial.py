@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -113,26 +114,22 @@ def _scene(device: str, with_cube: bool, count: int = 2) -> tuple[SceneLayout, T
     return layout, Tables(_random(device, rows, 1) - 0.5, _random(device, rows, 1), touched)
 
 
-def _rays(device: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Origins, directions, nears and fars."""
-    origins = _random(device, RAYS, 3) * 0.4 - 0.2
-    directions = torch.cat([_random(device, RAYS, 2) - 0.5, torch.ones(RAYS, 1, device=device)], -1)
-    near = torch.full((RAYS, 1), 0.05, device=device)
-    return origins, torch.nn.functional.normalize(directions, dim=-1), near, torch.full_like(near, torch.inf)
-
-
-def _marches(device: str, shapes: Shapes) -> list[tuple]:
-    cases = []
+def _marches(device: str, shapes: Shapes, shows: bool = False) -> list[tuple]:
+    """Of the march, or of pictures, which also take features."""
+    cases, near = [], torch.full((RAYS, 1), 0.05, device=device)
+    ahead = torch.cat([_random(device, RAYS, 2) - 0.5, torch.ones(RAYS, 1, device=device)], -1)
+    directions = torch.nn.functional.normalize(ahead, dim=-1)
+    rays = Rays(_random(device, RAYS, 3) * 0.4 - 0.2, directions, near, torch.full_like(near, torch.inf))
     for mpis in shapes.mpis:
         some, every = MarchOptions(0.02 / max(mpis, 2)), MarchOptions(0.0)
         layout, tables = _scene(device, shapes.cube, mpis)
-        rays = Rays(*_rays(device))
-        cases += [(layout, tables, rays, options) for options in (some, every)]
+        scene = (layout, tables, 2 * _random(device, len(tables.density), shapes.channels) - 1)[: 3 if shows else 2]
+        cases += [(*scene, rays, options) for options in (some, every)]
         if shapes.blends:
-            cases.append((layout, tables, rays, some._replace(blends=True)))
+            cases.append((*scene, rays, some._replace(blends=True)))
             # Before that, each MPI answers rays of its own.
             for which in ((_random(device, RAYS, layout.num_heads) < 0.5, None), (None, _random(device, RAYS, mpis))):
-                cases.append((layout, tables, Rays(*_rays(device), *which), some))
+                cases.append((*scene, Rays(*rays[:4], *which), some))
     return cases
 
 
@@ -163,17 +160,10 @@ def _gathers(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
-def _pictures(device: str, shapes: Shapes) -> list[tuple]:
-    return [
-        (layout, tables, 2 * _random(device, len(tables.density), shapes.channels) - 1, *how)
-        for layout, tables, *how in _marches(device, shapes)
-    ]
-
-
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "march": _marches,
     "total_variation": _variations,
     "gather_taps": _gathers,
-    "show_rays": _pictures,
+    "show_rays": partial(_marches, shows=True),
 }
 """Arguments for every operation that has a GPU form."""

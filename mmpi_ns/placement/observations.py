@@ -169,22 +169,6 @@ class Observations:
         return np.stack([fx * local[:, 0] / depth + cx, cy - fy * local[:, 1] / depth], -1), ahead
 
 
-def frustum_points(observations: Observations, near: Array) -> Array:
-    """Points [M * FILLING, 3] that fill the camera frusta from depths ``near`` [M] on, camera after camera, uniform in
-    pixels and in disparity; the last of each camera far away.
-
-    Deterministic (a low-discrepancy sequence), so equal scenes give equal points.
-    """
-    index = np.arange(FILLING)
-    uvw = np.stack([(index * g) % 1.0 for g in (0.7548776662, 0.5698402910, 0.8191725134)], -1)
-    clouds = []
-    for i, (pose, start) in enumerate(zip(observations.camera_to_worlds, near, strict=True)):
-        depth = start / np.maximum(uvw[:, 2], 1e-3)
-        local = observations.directions(i, uvw[:, :2]) * depth[:, None]
-        clouds.append(local @ pose[:, :3].T + pose[:, 3])
-    return np.concatenate(clouds)
-
-
 @dataclass(frozen=True)
 class VisiblePoints:
     """The points that placement weighs, and the cameras that see them."""
@@ -233,10 +217,16 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     cameras, points = cameras[keep], points[keep]
     seen = np.bincount(cameras, minlength=len(centers))
     share = (1 - FRUSTUM_SHARE) * seen / (seen + FEW)
-    filling = frustum_points(observations, nearest)
+    # Points of a frustum are uniform in pixels and in disparity, by a sequence that is the same each time.
+    uvw = np.stack([(np.arange(FILLING) * g) % 1.0 for g in (0.7548776662, 0.5698402910, 0.8191725134)], -1)
+    clouds = [points]
+    for i, pose in enumerate(observations.camera_to_worlds):
+        depth = nearest[i] / np.maximum(uvw[:, 2], 1e-3)
+        local = observations.directions(i, uvw[:, :2]) * depth[:, None]
+        clouds.append(local @ pose[:, :3].T + pose[:, 3])
     return VisiblePoints(
         cameras=np.concatenate([cameras, np.repeat(np.arange(len(centers)), FILLING)]),
-        points=np.concatenate([points, filling]),
+        points=np.concatenate(clouds),
         weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / FILLING, FILLING)]),
         nearest=nearest,
         typical=typical,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,14 @@ ROUNDS = 50
 """Rounds of moving windows to the middle of their cameras."""
 
 
+class Ball(NamedTuple):
+    """A window without its plan."""
+
+    center: Array
+    radius: float
+    margin: float
+
+
 def place_windows(
     observations: Observations, config: PlacementConfig, training_rays: int | None = None
 ) -> WindowedPlan:
@@ -30,9 +39,10 @@ def place_windows(
     if len(balls) < 2:
         return WindowedPlan.single(place(observations, config, training_rays))
     windows = []
-    for center, radius, margin in balls:
-        observed = of_cameras(observations, cameras_in(observations.centers, center, radius + margin))
-        windows.append(Window(tuple(center.tolist()), radius, margin, place(observed, config, training_rays)))
+    for ball in balls:
+        observed = of_cameras(observations, cameras_of(ball, observations.centers))
+        center = tuple(ball.center.tolist())
+        windows.append(Window(center, ball.radius, ball.margin, place(observed, config, training_rays)))
     return WindowedPlan(tuple(windows))
 
 
@@ -40,12 +50,12 @@ def most_pixels(observations: Observations, config: PlacementConfig) -> float:
     """Training pixels of the largest window of a capture."""
     balls = find_balls(observations, config.window_length)
     pixels = observations.sizes.prod(-1)
-    windows = [cameras_in(observations.centers, center, radius + margin) for center, radius, margin in balls]
+    windows = [cameras_of(ball, observations.centers) for ball in balls]
     return float(max((pixels[cameras].sum() for cameras in windows), default=pixels.sum()))
 
 
-def find_balls(observations: Observations, length: float) -> list[tuple[Array, float, float]]:
-    """(centre, radius, margin) of the windows, in order along the way; independent of the cameras' order. ``length`` is
+def find_balls(observations: Observations, length: float) -> list[Ball]:
+    """Where the windows are, in order along the way; independent of the cameras' order. ``length`` is
     the maximum of a window, in median distances of the content; 0 for no windows."""
     if length <= 0:
         return []
@@ -79,17 +89,13 @@ def find_balls(observations: Observations, length: float) -> list[tuple[Array, f
         order.append(min(left, key=lambda i: float(np.linalg.norm(middles[i] - at))))
         left.remove(order[-1])
         at = middles[order[-1]]
-    return [(middles[i], radii[i], MARGIN * longest) for i in order]
+    return [Ball(middles[i], radii[i], MARGIN * longest) for i in order]
 
 
-def cameras_of(window: Window, centers: Array) -> NDArray[np.int64]:
+def cameras_of(window: Window | Ball, centers: Array) -> NDArray[np.int64]:
     """Cameras with a share in a window, which its placement and training use; all cameras if there is only one."""
-    return cameras_in(centers, np.asarray(window.center), window.radius + window.margin)
-
-
-def cameras_in(centers: Array, middle: Array, radius: float) -> NDArray[np.int64]:
-    """Cameras in a ball; all if its radius is infinite."""
-    return np.nonzero(np.linalg.norm(centers - middle, axis=-1) < radius)[0]
+    distance = np.linalg.norm(centers - np.asarray(window.center), axis=-1)
+    return np.nonzero(distance < window.radius + window.margin)[0]
 
 
 def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observations:

@@ -6,9 +6,8 @@ resulting share depends on the position alone, so a baked texel stores the optic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,8 +34,6 @@ from mmpi_ns.scene.baked import (
 )
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
-
-Item = TypeVar("Item")
 
 THINNEST = -12.0
 """Lower bound on the raw density of code 0; its softplus is 6e-6."""
@@ -109,18 +106,12 @@ class BakedWindow:
         nears = torch.full_like(origins[:, :1], self.ray_near)
         return nears, torch.full_like(nears, torch.inf)
 
-    def peaks(
-        self, views: Sequence[Item], rays_of: Callable[[Item], tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]
-    ) -> Float[Tensor, "B 8 8"]:
-        """Largest weight of any sample of some views in each texel.
-
-        Args:
-            views: whatever ``rays_of`` takes.
-            rays_of: origins and unit directions of a view's rays.
-        """
+    def peaks(self, views: Iterable[tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]) -> Float[Tensor, "B 8 8"]:
+        """Largest weight of any sample of some views, given by origins and unit directions of their rays, in each
+        texel."""
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
-            for o, d in zip(*(x.split(AT_ONCE) for x in rays_of(view)), strict=True):
+            for o, d in zip(*(x.split(AT_ONCE) for x in view), strict=True):
                 show_baked(self.mpis, Rays(o, d, *self.unbounded(o)), self.threshold, peaks)
         return peaks
 
@@ -197,7 +188,7 @@ def bake(
     mpis = BakedMpis(plan.mpis, intervals, *tables, density_codes, channels)
     numbers = [x.detach().cpu() for x in network.layers(0)]
     numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
-    shader = Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.direction_frequencies, MOST_CHANGE)
+    shader = Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.frequencies[0], MOST_CHANGE)
     farthest = 10 * max(m.farthest for m in plan.mpis)
     return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
 
@@ -253,7 +244,7 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
             tangents = u0 + x / (grid.width - 1) * (u1 - u0), v0 + y / (grid.height - 1) * (v1 - v0)
             # Rays from the MPI's own origin, to keep precision far from the world's.
             directions = geometry.rotate(frames.axes[k].T, torch.stack([*tangents, torch.ones_like(x)], -1))
-            disparity = (mpi.planes - 1 - plane) * mpi.disparity_step + mpi.last_disparity
+            disparity = (mpi.planes - 1 - plane) * mpi.disparity_step + 1 / mpi.far
             local = geometry.LocalRays.of(frames.origins[k].expand_as(directions), directions, frames)
             numbers = torch.arange(len(part), device=part.device)
             samples = (numbers, local, disparity, torch.full_like(numbers, k))

@@ -105,24 +105,9 @@ class Details:
         Args:
             outputs: of the field.
             bundle: rays of the image. [H, W]
-            nearest: as for ``of_image``.
-            exposure: of rgb over the radiance; None if they are the same.
-        """
-        detail = self.of_image(bundle, outputs["depth"], nearest) * outputs["accumulation"]
-        rgb = (outputs["rgb"] + (detail if exposure is None else exposure * detail)).clamp(0, 1)
-        shown = outputs | {"rgb": rgb, "field_rgb": outputs["rgb"]}
-        if "radiance" in outputs:
-            shown |= {"radiance": outputs["radiance"] + detail, "field_radiance": outputs["radiance"]}
-        return shown
-
-    def of_image(self, bundle: RayBundle, depth: Float[Tensor, "H W 1"], nearest: int) -> Float[Tensor, "H W 3"]:
-        """What to add to the radiance of an image.
-
-        Args:
-            bundle: its rays. [H, W]
-            depth: rendered distances along them.
             nearest: number of training images that it takes details from. The next one's distance is where shares
                 reach 0, so that none appears at once as a camera moves.
+            exposure: of rgb over the radiance; None if they are the same.
         """
         origins, directions = bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)
         pose = np.zeros((1, 3, 4))
@@ -135,8 +120,14 @@ class Details:
         limit = distances[-1] if len(chosen) > nearest and distances[-1] > 0 else np.inf
         chosen, shares = chosen[:nearest], (1 - (distances / limit) ** 2)[:nearest].tolist()
         views = [self.view(i, origins.device) for i in chosen]
-        rays = zip(*(x.split(PART) for x in (origins, directions, depth.reshape(-1, 1))), strict=True)
-        return torch.cat([blended_details(views, shares, *part) for part in rays]).view(bundle.origins.shape)
+        rays = zip(*(x.split(PART) for x in (origins, directions, outputs["depth"].reshape(-1, 1))), strict=True)
+        detail = torch.cat([blended_details(views, shares, *part) for part in rays]).view(bundle.origins.shape)
+        detail = detail * outputs["accumulation"]
+        rgb = (outputs["rgb"] + (detail if exposure is None else exposure * detail)).clamp(0, 1)
+        shown = outputs | {"rgb": rgb, "field_rgb": outputs["rgb"]}
+        if "radiance" in outputs:
+            shown |= {"radiance": outputs["radiance"] + detail, "field_radiance": outputs["radiance"]}
+        return shown
 
 
 def read_details(folder: Path) -> tuple[int, Details]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -59,7 +58,8 @@ def psnr_and_ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H 
 
 def psnr(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> float:
     """PSNR of colours in [0, 1], dB; at most 120."""
-    squares = [((a.double() - b.double()) ** 2).sum() for a, b in _parts(predicted, observed)]
+    parts = zip(predicted.reshape(-1, 3).split(PART), observed.reshape(-1, 3).split(PART), strict=True)
+    squares = [((a.double() - b.double()) ** 2).sum() for a, b in parts]
     return float(-10 * torch.log10((torch.stack(squares).sum() / predicted.numel()).clamp(min=1e-12)))
 
 
@@ -86,21 +86,16 @@ def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "
     # Normal equations with a little of the identity: images of one colour have many solutions.
     normal = 1e-6 * predicted[..., 0].numel() * torch.eye(4, dtype=torch.float64, device=predicted.device)
     target = normal.new_zeros(4, 3)
-    for colors, aim in _parts(predicted, observed):
+    parts = predicted.reshape(-1, 3).split(PART)
+    for colors, aim in zip(parts, observed.reshape(-1, 3).split(PART), strict=True):
         design = pad(colors.double(), (0, 1), value=1.0)
         normal += design.T @ design
         target += design.T @ (aim.double() - colors.double())
     change = torch.linalg.solve(normal, target)
     corrected = [
-        (colors.double() + pad(colors.double(), (0, 1), value=1.0) @ change).clamp(0, 1).to(colors)
-        for colors, _ in _parts(predicted, observed)
+        (colors.double() + pad(colors.double(), (0, 1), value=1.0) @ change).clamp(0, 1).to(colors) for colors in parts
     ]
     return torch.cat(corrected).view(predicted.shape)
-
-
-def _parts(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Colours [P, 3] of both images, a part at a time."""
-    return zip(predicted.reshape(-1, 3).split(PART), observed.reshape(-1, 3).split(PART), strict=True)
 
 
 def image_scores(

@@ -78,33 +78,29 @@ class WindowStore:
             InputError: the file is missing or damaged (says which, and what to do).
         """
         with uninterrupted(), self._lock:
-            field = self._alive.get(window)
+            field, path = self._alive.get(window), self.path(window)
             if field is None:
-                field = self._read(window).to(device).eval()
+                if not path.is_file():
+                    raise InputError(
+                        f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' "
+                        "back, or name where it is in config.yml (pipeline.model.windows_folder)."
+                    )
+                try:
+                    state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
+                    needed = sum(x.nbytes * (2 if x.dtype == torch.float16 else 1) for x in state.values())
+                    while self._held and needed + sum(held.nbytes for held in self._held.values()) > self.budget:
+                        del self._held[next(iter(self._held))]  # the least recently used
+                    field = self.empty()
+                    field.load_state_dict(state)
+                except (*_DAMAGED, AttributeError) as error:
+                    raise InputError(
+                        f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it "
+                        "anew, or train it again: resume from a checkpoint of before its end with --load-step."
+                    ) from error
+                field = field.to(device).eval()
             self._held.pop(window, None)
             self._held[window] = self._alive[window] = field
             return field
-
-    def _read(self, window: int) -> MMPIField:
-        path = self.path(window)
-        if not path.is_file():
-            raise InputError(
-                f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' back, or "
-                "name where it is in config.yml (pipeline.model.windows_folder)."
-            )
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
-            needed = sum(x.nbytes * (2 if x.dtype == torch.float16 else 1) for x in state.values())
-            while self._held and needed + sum(held.nbytes for held in self._held.values()) > self.budget:
-                del self._held[next(iter(self._held))]  # the least recently used
-            field = self.empty()
-            field.load_state_dict(state)
-        except (*_DAMAGED, AttributeError) as error:
-            raise InputError(
-                f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
-                "train it again: resume from a checkpoint of before its end with --load-step."
-            ) from error
-        return field
 
     def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
         """Takes over finished windows of the run that this one resumes.

@@ -93,10 +93,6 @@ class BakedMpis:
     def num_bricks(self) -> int:
         return len(self.density)
 
-    @property
-    def nbytes(self) -> int:
-        return self.columns.nbytes + self.density.nbytes + self.texels.nbytes
-
     def first_column(self, k: int) -> int:
         """Of MPI k; of those behind the last one, the number of columns."""
         return sum(math.prod(tiles_of(m)) for m in self.mpis[:k])

@@ -37,11 +37,12 @@ class Frames:
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
-        shapes = {"origin": (3,), "axes": (3, 3), "near": (), "extent": (4,), "last_disparity": ()}
-        origins, axes, nears, extents, ends = (
+        shapes = {"origin": (3,), "axes": (3, 3), "near": (), "extent": (4,)}
+        origins, axes, nears, extents = (
             torch.tensor([getattr(m, name) for m in mpis], dtype=dtype, device=device).reshape(len(mpis), *shape)
             for name, shape in shapes.items()
         )
+        ends = torch.tensor([1 / m.far for m in mpis], dtype=dtype, device=device)
         planes = torch.tensor([m.planes for m in mpis], dtype=torch.int64, device=device)
         shares = 1.0 - nears * ends
         steps = shares / (nears * (planes - 1).to(dtype))

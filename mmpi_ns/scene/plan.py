@@ -57,14 +57,9 @@ class MPIPlan:
     """Depth of the last plane; inf (in JSON: null) for an MPI that reaches to infinity."""
 
     @property
-    def last_disparity(self) -> float:
-        """1 / far: disparity of the last plane, 0 at infinity."""
-        return 1.0 / self.far
-
-    @property
     def depth_share(self) -> float:
         """1 - near / far: the fraction of all disparities beyond the near plane that the planes span; 1 to infinity."""
-        return 1.0 - self.near * self.last_disparity
+        return 1.0 - self.near * (1.0 / self.far)
 
     @property
     def disparity_step(self) -> float:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,6 +25,8 @@ PART = 1 << 14
 """Tiles that are looked at together."""
 REMEMBERED = 128
 """Plans and cameras whose tiles are remembered, a bit each; the windows of a long capture have a plan each."""
+_remembered: dict[tuple[bytes, ScenePlan], tuple[NDArray[np.uint8], int]] = {}
+"""Marks of all tiles, eight in a byte, and their number, the most recently used last."""
 
 
 @dataclass(frozen=True)
@@ -76,29 +77,20 @@ def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.d
         On the CPU.
     """
     cameras = hashlib.sha256(views.origins.numpy().tobytes() + views.inward.contiguous().numpy().tobytes())
-    marks, count = _packed_tiles(_Key(cameras.digest(), plan, views, torch.device(device)))
+    key = cameras.digest(), plan  # on whatever device
+    packed = _remembered.pop(key, None)
+    if packed is None:
+        tiles = [_tiles_of(mpi, views, torch.device(device)).reshape(-1).cpu() for mpi in plan.mpis]
+        if plan.cube is not None:
+            depth, height, width = plan.cube.shape
+            tiles.append(torch.ones(depth * -(-height // SIDE) * -(-width // SIDE), dtype=torch.bool))
+        marks = torch.cat(tiles).numpy()
+        packed = np.packbits(marks), len(marks)
+    _remembered[key] = packed
+    if len(_remembered) > REMEMBERED:
+        del _remembered[next(iter(_remembered))]
+    marks, count = packed
     return torch.from_numpy(np.unpackbits(marks, count=count).view(bool))
-
-
-@dataclass(frozen=True)
-class _Key:
-    """What tiles in reach depend on; equal where cameras and plan are equal, on whatever device."""
-
-    digest: bytes
-    plan: ScenePlan
-    views: TrainingViews = field(compare=False)
-    device: torch.device = field(compare=False)
-
-
-@lru_cache(REMEMBERED)
-def _packed_tiles(key: _Key) -> tuple[NDArray[np.uint8], int]:
-    """Marks of all tiles, eight in a byte, and their number."""
-    tiles = [_tiles_of(mpi, key.views, key.device).reshape(-1).cpu() for mpi in key.plan.mpis]
-    if key.plan.cube is not None:
-        depth, height, width = key.plan.cube.shape
-        tiles.append(torch.ones(depth * -(-height // SIDE) * -(-width // SIDE), dtype=torch.bool))
-    marks = torch.cat(tiles).numpy()
-    return np.packbits(marks), len(marks)
 
 
 def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[Tensor, "L Y X"]:
@@ -121,7 +113,7 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[
         along.append((slope[..., None, None] * tangents).amax(-2).to(device))
     along_x, along_y = along
     shift, ahead = (normals * origins[:, None]).sum(-1), normals[..., 2]
-    w = mpi.last_disparity + torch.arange(mpi.planes - 1, -1, -1, dtype=torch.float64) * mpi.disparity_step
+    w = 1 / mpi.far + torch.arange(mpi.planes - 1, -1, -1, dtype=torch.float64) * mpi.disparity_step
     rest = ahead - w[:, None, None] * shift
     rest[w[:, None] * origins[:, 2] >= 1] = -torch.inf  # cameras that a plane lies behind
     rest = rest.to(device)

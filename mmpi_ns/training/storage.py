@@ -74,16 +74,13 @@ def prepare_storage(
 def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any, Any]]) -> None:
     """Makes texels finer than planned where bricks were released: as fine as the plan allows within ``budget`` bytes of
     tables and moments. ``trained`` are optimisers and their tables."""
-    plan = field.full_plan
-
-    def bytes_of(tiles: Tensor) -> int:
-        return stored_bytes(int((tiles > 0).sum()), len(tiles), work)
-
+    plan, needed = field.full_plan, stored_bytes(field.num_bricks, len(field.tiles), work)
     longest = max(n for shape in head_shapes(plan) for n in shape[1:])
-    factor = min(plan.detail, (MOST_TEXELS / longest) ** 2, field.factor * budget / bytes_of(field.tiles))
+    factor = min(plan.detail, (MOST_TEXELS / longest) ** 2, field.factor * budget / needed)
     while factor >= WORTH * field.factor:
         tiles = field.tiles_at(factor)
-        if bytes_of(tiles) <= budget:
+        needed = stored_bytes(int((tiles > 0).sum()), len(tiles), work)
+        if needed <= budget:
             for optimizer, table in trained:
                 optimizer.state.pop(table, None)
             give_back_freed_memory()
@@ -91,7 +88,7 @@ def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any,
             give_back_freed_memory()
             say(f"Texels are {factor:.1f} times as many as planned now, in the room that released ones left.")
             return
-        factor *= min(0.98, budget / bytes_of(tiles))
+        factor *= min(0.98, budget / needed)
 
 
 def copy_finely(
@@ -104,8 +101,8 @@ def copy_finely(
     order = gain[1:].argsort(descending=True, stable=True) + 1
     order = order[grids[0].places[order] < first_voxel]  # the cube has no copy
 
-    def chosen(count: int) -> Tensor:
-        """Tiles of the first bricks, and the stored ones around them on their planes."""
+    def chosen(count: int) -> tuple[Tensor, bool]:
+        """Tiles of the first bricks and the stored ones around them on their planes; whether their copies fit."""
         tiles = torch.zeros_like(field.tiles, dtype=torch.bool)
         tiles[grids[0].places[order[:count]]] = True
         wide = tiles.clone()
@@ -113,20 +110,19 @@ def copy_finely(
             here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
             images = tiles[here].view(grid.own_tiles.shape)[:, None].float()
             wide[here] |= (max_pool2d(images, 3, 1, 1) > 0).reshape(-1)
-        return wide & (field.tiles > 0)
-
-    def fits(count: int) -> bool:
-        fine, kept = tiles_with_copies(grids, copies, chosen(count))
-        return stored_bytes(int(fine.sum()) + int(kept.sum()), len(fine) + len(kept), work) <= budget
+        wide &= field.tiles > 0
+        fine, kept = tiles_with_copies(grids, copies, wide)
+        needed = stored_bytes(int(fine.sum()) + int(kept.sum()), len(fine) + len(kept), work)
+        return wide, needed <= budget
 
     # More bricks nearly always take more room. The number taken fits, whether or not a few more would.
     most = int(MOST_COPIED * len(order))
-    count = bisect_left(range(1, most + 1), True, key=lambda n: not fits(n))
+    count = bisect_left(range(1, most + 1), True, key=lambda n: not chosen(n)[1])
     if not count or not float(gain.sum()) > 0:
         return
     for optimizer, table in trained:
         optimizer.state.pop(table, None)
-    tiles = chosen(count)
+    tiles, _ = chosen(count)
     share = float(gain[field.tiles[tiles].to(torch.int64)].sum() / gain.sum())
     stored = int(tiles.sum()) / field.num_bricks
     give_back_freed_memory()

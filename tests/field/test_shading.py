@@ -43,7 +43,7 @@ def shaded_by_hand(networks, mean, direction):
     for shape in networks.shapes:
         layers.append(flat[start : start + math.prod(shape)].reshape(shape))
         start += math.prod(shape)
-    waves = [direction * math.pi * 2**i for i in range(networks.direction_frequencies)]
+    waves = [direction * math.pi * 2**i for i in range(networks.frequencies[-1])]
     x = np.concatenate([mean, direction, *map(np.sin, waves), *map(np.cos, waves)])
     hidden = np.maximum(layers[0] @ x + layers[1], 0)
     hidden = np.maximum(layers[2] @ hidden + layers[3], 0)
@@ -142,7 +142,7 @@ def test_a_fresh_network_shows_the_diffuse_colour():
 
 def shade(weights, texels, network=0.3, channels=7):
     """One ray of samples with given colours and features: its colour, and the gradients of weights and texels."""
-    shader = RayShader(channels, 8, 2)
+    shader = RayShader(1, channels, 8, 2)
     generator = torch.Generator().manual_seed(0)
     shader.weights.data = torch.randn(shader.weights.shape, generator=generator) * network
     weights, texels = (torch.tensor(x, dtype=torch.float32).requires_grad_() for x in (weights, texels))

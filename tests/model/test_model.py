@@ -148,7 +148,7 @@ def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path)
     trainer = trainer_of(scene, plan, tmp_path, training="two-phase")
     model = trainer.pipeline.model
     assert [p.name for p in model.progress.schedule.phases] == ["joint"]
-    assert model.field.depth_scale == 1
+    assert model.field.layout.depth_scale == 1
     for step in (0, 12, 23):
         _, losses, _ = run_step(trainer, step)
         assert all(torch.isfinite(v) for v in losses.values())

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import trial
 from mmpi_ns.ops.baked import show_baked
-from mmpi_ns.ops.layout import Tables, check_shapes
+from mmpi_ns.ops.layout import SMALL, Tables, check_shapes
 from mmpi_ns.ops.march import MarchOptions, Rays, march, show_rays
 
 
@@ -81,9 +81,10 @@ def changed(x, rows, columns):
 
 def walked():
     """Arguments of the march and of pictures: a layout, tables, features, rays and options."""
-    (layout, tables), rays = trial._scene("cpu", True), [x[:5] for x in trial._rays("cpu")]
+    layout, tables, rays, _ = trial._marches("cpu", SMALL)[0]
     heads, priorities = torch.ones(5, 3, dtype=torch.bool), torch.rand(5, 2)
-    return layout, tables, torch.zeros(len(tables.density), 4), Rays(*rays, heads, priorities), MarchOptions(0.01)
+    rays = Rays(*(x[:5] for x in rays[:4]), heads, priorities)
+    return layout, tables, torch.zeros(len(tables.density), 4), rays, MarchOptions(0.01)
 
 
 @pytest.mark.parametrize("change", WIDER)

@@ -138,7 +138,9 @@ def test_details_change_smoothly_as_a_camera_moves(tmp_path):
     details, shown = read_details(tmp_path)[1], []
     for x in np.linspace(0.2, 0.8, 241):
         bundle = image_rays(camera(float(x)))
-        shown.append(details.of_image(bundle, torch.full((HEIGHT, WIDTH, 1), 4.0), 2)[8:12, 12:16].mean())
+        nothing, whole = torch.zeros(HEIGHT, WIDTH, 3), torch.ones(HEIGHT, WIDTH, 1)
+        outputs = {"rgb": nothing, "radiance": nothing, "depth": 4 * whole, "accumulation": whole}
+        shown.append(details.added(outputs, bundle, 2, None)["radiance"][8:12, 12:16].mean())
     steps = torch.stack(shown).diff().abs()
     assert torch.stack(shown).std() > 0.05
     assert steps.max() < 0.03

@@ -105,7 +105,7 @@ def test_planes_that_every_camera_has_passed_are_out_of_reach():
     shot.camera_to_worlds[:, :, 3] = torch.tensor([0.0, 0.0, 2.0])
     found = reachable_tiles(TrainingViews.of(shot), ScenePlan((mpi,), None, 0.05, 1.0))
     steps = torch.arange(mpi.planes - 1, -1, -1)
-    depths = 1 / (mpi.last_disparity + steps * mpi.disparity_step)
+    depths = 1 / (1 / mpi.far + steps * mpi.disparity_step)
     ahead = found.view(mpi.planes, -1).any(1)
     assert (depths < 2).any() and torch.equal(ahead, depths > 2)
 
@@ -116,7 +116,7 @@ def test_tiles_of_all_images_are_those_of_each_alone_and_found_once(monkeypatch,
     views, plan, looks = TrainingViews.of(cameras(5, count, turn=0.8)), plan_around(1), []
     tiles_of = visible_tiles._tiles_of
     monkeypatch.setattr(visible_tiles, "_tiles_of", lambda *given: looks.append(given) or tiles_of(*given))
-    visible_tiles._packed_tiles.cache_clear()
+    visible_tiles._remembered.clear()
     whole = reachable_tiles(views, plan)
     alone = [reachable_tiles(TrainingViews(*(x[i : i + 1] for x in vars(views).values())), plan) for i in range(count)]
     assert torch.equal(whole, torch.stack(alone).any(0)) and not whole.all()

@@ -51,8 +51,8 @@ class ExactField:
         networks = source.networks
         tables = {name: split(name) for name in (*TABLES[:3], "touched")}
         tables["networks"] = [networks.weights.detach().double().cpu().numpy()]
-        frequencies = getattr(networks, "position_frequencies", 0), networks.direction_frequencies
-        numbers = source.shading, source.depth_scale, source.samples_per_voxel, source.cube_alpha
+        frequencies = (0, *networks.frequencies)[-2:]
+        numbers = source.shading, source.layout.depth_scale, source.samples_per_voxel, source.cube_alpha
         return ExactField(source.plan, tables, list(networks.shapes), frequencies, *numbers)
 
 

@@ -148,7 +148,7 @@ def test_tiles_in_reach_are_looked_for_once_in_a_run(scene, plan_file, tmp_path,
     """To size the tables, to say so, and to fill them: three times the same at full resolution."""
     looked, tiles_of = [], visible_tiles._tiles_of
     monkeypatch.setattr(visible_tiles, "_tiles_of", lambda mpi, *given: looked.append(mpi) or tiles_of(mpi, *given))
-    visible_tiles._packed_tiles.cache_clear()
+    visible_tiles._remembered.clear()
     trainer = ready(trainer_config(scene, plan_file, tmp_path, 16, training="joint"))
     trainer.train()
     full = [mpi for mpi in looked if mpi in trainer.pipeline.model.progress.windows.plans[0].mpis]

@@ -104,7 +104,7 @@ def _pack(baked: BakedMpis) -> ctypes.Array:
         u0, u1, v0, v1 = mpi.extent
         scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
         sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], baked.first_column(k))
-        places = map(float, (mpi.disparity_step, mpi.last_disparity, u0, v0, *scales))
+        places = map(float, (mpi.disparity_step, 1 / mpi.far, u0, v0, *scales))
         stacks.append((*places, *map(ctypes.c_int32, sizes)))
     density = shaped(baked.density, bricks, SIDE, SIDE, dtype=torch.uint8)
     texels = shaped(baked.texels, bricks, SIDE, SIDE, channels, dtype=torch.uint8)

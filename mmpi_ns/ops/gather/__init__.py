@@ -105,12 +105,6 @@ def interpolated(
         yield slots, interpolate_densely(table, rows, weights)
 
 
-def split_sums(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The parts of ``RaySums`` from what the compiled forms write: weighted texels, mass, squared colours."""
-    gathered, mass, second = sums.split([channels, 1, COLORS], -1)
-    return gathered, mass, gathered[:, :COLORS].clone(), second
-
-
 def _sums(raw: Tensor, slots: Tensor, weights: Tensor) -> RaySums:
     rays, num_rays = slots // weights.shape[1], weights.shape[0]
     value, weight = activate(raw), weights.reshape(-1)[slots][:, None]
@@ -148,9 +142,9 @@ class _GatherTaps(torch.autograd.Function):
         samples = (_groups(saved[4:]), numbers, weights, width)
         call_in_parts("mmpi_gather_taps", num_rays, values, *values.shape, *samples, sums)
         ctx.save_for_backward(*saved)
-        parts = split_sums(sums, channels)
-        ctx.mark_non_differentiable(parts[1])
-        return parts
+        gathered, mass, second = sums.split([channels, 1, COLORS], -1)
+        ctx.mark_non_differentiable(mass)
+        return gathered, mass, gathered[:, :COLORS].clone(), second
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:

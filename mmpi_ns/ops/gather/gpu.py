@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gather import COLORS, RaySums, Taps, split_sums
+from mmpi_ns.ops.gather import COLORS, RaySums, Taps
 from mmpi_ns.ops.gpu_scene import block_size, launch
 
 NUMBERS = 512
@@ -133,9 +133,9 @@ class _GatherTaps(torch.autograd.Function):
             HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block, num_warps=warps,
         )  # fmt: skip
         ctx.save_for_backward(*saved)
-        parts = split_sums(sums, channels)
-        ctx.mark_non_differentiable(parts[1])
-        return parts
+        gathered, mass, second = sums.split([channels, 1, COLORS], -1)
+        ctx.mark_non_differentiable(mass)
+        return gathered, mass, gathered[:, :COLORS].clone(), second
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:

@@ -104,9 +104,9 @@ def texel_rows(
         ndc: position of each sample in its MPI.
     """
     names = ("height", "width", "down", "across", "first_tile")
-    sizes = layout.once(
-        "sizes", lambda it: torch.tensor([[getattr(g, name) for name in names] for g in it.grids], device=heads.device)
-    )
+    if (sizes := layout.packed.get("sizes")) is None:
+        sizes = torch.tensor([[getattr(grid, name) for name in names] for grid in layout.grids], device=heads.device)
+        layout.packed["sizes"] = sizes
     of_samples: dict[str, Any] = dict(zip(names, sizes[heads].unbind(-1), strict=True))
     return replace(layout.grids[0], **of_samples).bilinear(planes, ndc)
 

@@ -7,7 +7,6 @@ must weigh to be kept), so a ray costs what lies in front of its first surfaces.
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any, NamedTuple
 
 import torch
@@ -166,7 +165,7 @@ def _live_samples(
             u0, u1, v0, v1 = mpi.extent
             u = (ray[:, 0] + w * ray[:, 1] - u0) * (2 / (u1 - u0)) - 1
             v = (ray[:, 2] + w * ray[:, 3] - v0) * (2 / (v1 - v0)) - 1
-            ndc = torch.stack([u, v, 1 - 2 * mpi.near / mpi.depth_share * (w - mpi.last_disparity)], -1)
+            ndc = torch.stack([u, v, 1 - 2 * mpi.near / mpi.depth_share * (w - 1 / mpi.far)], -1)
             planes, inverse_t = mpi.planes - 1 - m, inverse_distance(w, ray[:, 4], ray[:, 5])
             texels = grid.bilinear(planes, ndc)
         else:
@@ -302,24 +301,22 @@ def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: March
     return MergedSamples(*slots, skipped_total=skipped, dropped_mass=dropped, live=live, explained=explained)
 
 
-def _tiles(layout: SceneLayout) -> ctypes.Array:
-    """The tiles of all MPIs from which something can be read, so that rays pass over the others: where the lower corner
-    of four texels is in the tile, one of them is stored."""
-    columns, bricks, count = [torch.zeros(0, 2, dtype=torch.int32)], [torch.zeros(1, 4, dtype=torch.int32)], 0
-    for grid in layout.grids[: len(layout.mpis)]:
-        tiles = pad(grid.own_tiles, (0, 1, 0, 1))
-        down, across = ((n - 2) // 8 + 1 for n in (grid.height, grid.width))  # of lower corners
-        corners = torch.stack([tiles[:, y : y + down, x : x + across] for y in (0, 1) for x in (0, 1)], -1)
-        stored, places = columns_from((corners > 0).any(-1), count)
-        columns.append(stored)
-        bricks.append(corners[tuple(places.T)])
-        count += len(places)
-    return structs((torch.cat(columns), torch.cat(bricks[1:] + bricks[:1])))
-
-
 @show_rays.on_cpu
 def show_rays_on_cpu(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
+    if "tiles" not in layout.packed:
+        # Rays pass over tiles from which nothing can be read: where the lower corner of four texels is in any other,
+        # one of them is stored.
+        columns, bricks, count = [torch.zeros(0, 2, dtype=torch.int32)], [torch.zeros(1, 4, dtype=torch.int32)], 0
+        for grid in layout.grids[: len(layout.mpis)]:
+            tiles = pad(grid.own_tiles, (0, 1, 0, 1))
+            down, across = ((n - 2) // 8 + 1 for n in (grid.height, grid.width))  # of lower corners
+            corners = torch.stack([tiles[:, y : y + down, x : x + across] for y in (0, 1) for x in (0, 1)], -1)
+            stored, places = columns_from((corners > 0).any(-1), count)
+            columns.append(stored)
+            bricks.append(corners[tuple(places.T)])
+            count += len(places)
+        layout.packed.setdefault("tiles", structs((torch.cat(columns), torch.cat(bricks[1:] + bricks[:1]))))
     walk = (layout.cpu_scene(tables), structs(dense_fields(rays)))
-    texels = (layout.once("tiles", _tiles), *dense(features), *features.shape)
+    texels = (layout.packed["tiles"], *dense(features), *features.shape)
     how = (float(options.threshold), float(options.fair_share), options.blends)
     return shown("mmpi_show", len(rays.origins), features.shape[1], *walk, *texels, *how)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.motion import between
 
 FAR = -1e4
 """Pixel of a point behind the other image."""
@@ -68,7 +69,7 @@ def place_pixels(
         b: change of the homogeneous pixel for each unit of inverse depth.
         first_row: row of the image with which ``inverse`` begins.
     """
-    x, y, ahead = (a + inverse * shift for a, shift in zip(_linear(inverse, linear, first_row), b, strict=True))
+    x, y, ahead = (a + inverse * shift for a, shift in zip(linear_at(inverse, linear, first_row), b, strict=True))
     behind = ~(ahead > LEAST_AHEAD)
     divisor = torch.where(behind, 1.0, ahead)
     x, y = (torch.where(behind, FAR, c / divisor) for c in (x, y))
@@ -86,15 +87,8 @@ def follow_motion(
         motion: right and down, pixels, of some rows.
         first_row: row of the maps with which ``motion`` begins.
     """
-    height, width = x.shape
-    right = (torch.arange(width) + motion[..., 0]).clamp(0, width - 1)
-    down = (torch.arange(len(motion))[:, None] + first_row + motion[..., 1]).clamp(0, height - 1)
-    left, top = right.long().clamp(max=width - 2), down.long().clamp(max=height - 2)
-    u, v = right - left, down - top
-    maps = torch.stack([x, y])
-    above, below = (torch.lerp(maps[:, row, left], maps[:, row, left + 1], u) for row in (top, top + 1))
-    moved_x, moved_y = torch.lerp(above, below, v)
-    return Moved(moved_x, moved_y)
+    right, down = torch.arange(x.shape[1]), torch.arange(len(motion))[:, None] + first_row
+    return Moved(*between(torch.stack([x, y], -1), right + motion[..., 0], down + motion[..., 1]).unbind(-1))
 
 
 @operation(in_cpp=0)
@@ -119,7 +113,7 @@ def solve_matches(
         variance: of a match where images look alike, square pixels.
         farthest_squared: square of the largest distance from the epipolar line, square pixels.
     """
-    a = _linear(x, linear, first_row)
+    a = linear_at(x, linear, first_row)
     r1, s1 = a[0] - x * a[2], b[0] - x * b[2]
     r2, s2 = a[1] - y * a[2], b[1] - y * b[2]
     squared = (s1 * s1 + s2 * s2).clamp(min=1e-20)
@@ -197,8 +191,8 @@ def compare_depths(
     return Compared(both & (apart.abs() < tolerance), both & (apart < -tolerance))
 
 
-def _linear(image: Tensor, linear: Tensor, first_row: int) -> list[Tensor]:
-    """The three parts of a at pixels of some rows. [H, W] each"""
+def linear_at(image: Tensor, linear: Tensor, first_row: int) -> list[Tensor]:
+    """The three parts of a at pixels of some rows of an image. [H, W] each"""
     x = torch.arange(image.shape[1], dtype=image.dtype) + 0.5
     y = torch.arange(image.shape[0], dtype=image.dtype)[:, None] + (first_row + 0.5)
     return [m[0] * x + (m[1] * y + m[2]) for m in linear]

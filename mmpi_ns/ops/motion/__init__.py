@@ -43,7 +43,7 @@ def refine_motion(
     patches = _Patches(gray, other, stride, coarse)
     scale = torch.tensor([small_width / width, small_height / height], dtype=coarse.dtype)
     x, y = (((at + SIDE / 2 + 0.5) * of - 0.5) for at, of in zip((patches.columns, patches.rows), scale, strict=True))
-    start = _between(coarse, x.expand(patches.shape), y.expand(patches.shape)) / scale
+    start = between(coarse, x.expand(patches.shape), y.expand(patches.shape)) / scale
     first, least = patches.descended(start, rounds)
     best = first
     for shift in ((0, 1), (0, -1), (1, 0), (-1, 0)):
@@ -54,7 +54,18 @@ def refine_motion(
         errors = torch.where(is_other, patches.compare(theirs)[0], torch.inf)
         best, least = torch.where((errors < least)[..., None], theirs, best), torch.minimum(errors, least)
     best = torch.where((best != first).any(-1, keepdim=True), patches.descended(best, rounds)[0], best)
-    return patches.averaged(best)
+    # Motions of pixels are those of the patches that they are in, where both images look alike first.
+    weight = 1 / patches.differences(best).abs().clamp(min=1)
+    rows = (patches.rows[..., None, None] + torch.arange(SIDE)[:, None]).expand(weight.shape)
+    columns = (patches.columns[:, None, None] + torch.arange(SIDE)).expand(weight.shape)
+    values = weight[..., None] * functional.pad(best, (0, 1), value=1.0)[:, :, None, None]
+    sums = torch.zeros(height, width, 3, dtype=best.dtype)
+    sums.index_put_((rows, columns), values, accumulate=True)
+    # Beyond the last patch as in it.
+    rows, columns = (torch.arange(n).clamp(max=int(at.max()) + SIDE - 1) for n, at in
+                     ((height, patches.rows), (width, patches.columns)))  # fmt: skip
+    sums = sums[rows[:, None], columns]
+    return sums[..., :2] / sums[..., 2:]
 
 
 class _Patches:
@@ -80,7 +91,7 @@ class _Patches:
         height, width = self.size
         x = (self.columns + motion[..., 0]).clamp(1 - SIDE, width - 1)[..., None, None] + torch.arange(SIDE)
         y = (self.rows + motion[..., 1]).clamp(1 - SIDE, height - 1)[..., None, None] + torch.arange(SIDE)[:, None]
-        return _between(self.other[..., None], *torch.broadcast_tensors(x, y))[..., 0] - self.gray
+        return between(self.other[..., None], *torch.broadcast_tensors(x, y))[..., 0] - self.gray
 
     def compare(self, motion: Tensor) -> tuple[Tensor, Tensor]:
         """Sums of squared differences less their means, and steps that make them least."""
@@ -101,22 +112,8 @@ class _Patches:
             goes_on = goes_on & ((at - start).square().sum(-1) <= FARTHEST**2)
         return best, least
 
-    def averaged(self, motion: Tensor) -> Tensor:
-        """Motions of pixels: of the patches that they are in, those where both images look alike first."""
-        weight = 1 / self.differences(motion).abs().clamp(min=1)
-        rows = (self.rows[..., None, None] + torch.arange(SIDE)[:, None]).expand(weight.shape)
-        columns = (self.columns[:, None, None] + torch.arange(SIDE)).expand(weight.shape)
-        sums = torch.zeros(*self.size, 3, dtype=motion.dtype)
-        values = weight[..., None] * functional.pad(motion, (0, 1), value=1.0)[:, :, None, None]
-        sums.index_put_((rows, columns), values, accumulate=True)
-        # Beyond the last patch as in it.
-        rows, columns = (torch.arange(n).clamp(max=int(at.max()) + SIDE - 1) for n, at in
-                         zip(self.size, (self.rows, self.columns), strict=True))  # fmt: skip
-        sums = sums[rows[:, None], columns]
-        return sums[..., :2] / sums[..., 2:]
 
-
-def _between(values: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def between(values: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Values [H, W, C] at places, interpolated; beyond the borders those of the border."""
     height, width = values.shape[:2]
     x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 
 from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.matches import linear_at
 
 REACH = 2
 """Pixels of a patch on each side of its middle."""
@@ -109,20 +110,14 @@ def spread_planes(
     factor = torch.exp2(changes[..., :1])
     patches = _better(references, patches, patches.planes * factor, others)
     (fx, fy, cx, cy), (q, right, down) = pinhole, (patches.planes / factor).unbind(-1)
-    x, y = _centers(before)
+    x, y = (torch.arange(n, dtype=before.dtype) + 0.5 for n in (width, height))
+    y = y[:, None]
     normal = torch.stack([fx * right, fy * down, q - right * (x - cx) - down * (y - cy)], -1)
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-20) + changes[..., 1:]
     towards = normal[..., 0] * (x - cx) / fx + normal[..., 1] * (y - cy) / fy + normal[..., 2]
     scale = q / torch.where(towards < 0, towards.clamp(max=-GRAZING), towards.clamp(min=GRAZING))
     turned = torch.stack([q, scale * normal[..., 0] / fx, scale * normal[..., 1] / fy], -1)
     return _better(references, patches, turned, others)
-
-
-def _centers(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Coordinates right [W] and down [H, 1] of pixels' centres."""
-    height, width = image.shape[:2]
-    kind = image.dtype if image.is_floating_point() else torch.float32
-    return torch.arange(width, dtype=kind) + 0.5, torch.arange(height, dtype=kind)[:, None] + 0.5
 
 
 class _References:
@@ -160,9 +155,8 @@ def _correlations(
     references: _References, planes: Tensor, corners: Tensor, sizes: Tensor, linear: Tensor, b: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Correlations of patches with one image (-1: none), and whether it shows their middles. [H, W] each"""
-    x, y = _centers(planes)
     q, right, down = planes.unbind(-1)
-    middle = torch.stack([m[0] * x + (m[1] * y + m[2]) + q * s for m, s in zip(linear, b, strict=True)])
+    middle = torch.stack([a + q * s for a, s in zip(linear_at(q, linear, 0), b, strict=True)])
     to_right, to_down = (
         torch.stack([linear[i, n] + slope * b[i] for i in range(3)]) for n, slope in enumerate((right, down))
     )
