@@ -7,7 +7,6 @@ import io
 import json
 import platform
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -21,7 +20,7 @@ from PIL import Image
 
 from mmpi_ns.bench.trainers import JOINT, NO_TRACKS, P, Scene, Steps, train_words
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.layout import EVERY, SMALL, Shapes
+from mmpi_ns.ops.layout import EVERY, SMALL
 from mmpi_ns.utils.machine import processor
 
 STEPS, RAYS = 20, 1024
@@ -54,7 +53,15 @@ class Gpu:
         if device == "cpu":
             tell("torch sees no GPU, so nothing is said of one here: what follows is this machine's processor.")
         report["device"] = device
-        report["operations"] = faults = try_operations(device, (SMALL,) if self.quick else EVERY)
+        # None where an operation works for all shapes, else why not.
+        form = "gpu" if device == "cuda" else "cpu"
+        faults: dict[str, str | None] = {n: None for n, each in dispatch.operations().items() if form in each.compiled}
+        with contextlib.redirect_stdout(io.StringIO()):  # the log of dispatch: it is said here
+            for shapes in (SMALL,) if self.quick else EVERY:
+                dispatch.expect(shapes, afresh=True)
+                for name, reason in faults.items():
+                    faults[name] = reason or dispatch.fault(name if device == "cuda" else "C++")
+        report["operations"] = faults
         for name, reason in faults.items():
             tell(f"{name}: {'ok' if reason is None else 'plain torch, since ' + reason}")
         slow = [name for name, reason in faults.items() if reason is not None]
@@ -111,18 +118,6 @@ def environment() -> dict[str, Any]:
         device = torch.cuda.get_device_properties(0)
         report["GPU"] = f"{device.name}, sm_{device.major}{device.minor}, {device.total_memory / 2**30:.0f} GiB"
     return report
-
-
-def try_operations(device: str, every: Sequence[Shapes]) -> dict[str, str | None]:
-    """Every operation with a compiled form for a device: None where it works for all shapes, else why not."""
-    form = "gpu" if device == "cuda" else "cpu"
-    faults: dict[str, str | None] = {n: None for n, each in dispatch.operations().items() if form in each.compiled}
-    with contextlib.redirect_stdout(io.StringIO()):  # the log of dispatch: it is said here
-        for shapes in every:
-            dispatch.expect(shapes, afresh=True)
-            for name, reason in faults.items():
-                faults[name] = reason or dispatch.fault(name if device == "cuda" else "C++")
-    return faults
 
 
 def time_training(device: str, data: Path, work: Path) -> dict[str, Any]:

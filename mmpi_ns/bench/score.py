@@ -59,10 +59,26 @@ class Score:
         check_transforms(parser, self.data, ("test",), opens=True)
         truths = MMPIDataset(parser.setup().get_dataparser_outputs(split="test"))
         chosen = evenly(len(truths), self.test_images)
-        files = find_renderings(self.images, [truths.image_filenames[i] for i in chosen])
+        tests = [truths.image_filenames[i] for i in chosen]
+        if not self.images.is_dir():
+            raise ValueError(f"There is no folder {self.images}: give the one that holds the renderings.")
+        by_name: dict[str, list[Path]] = {}
+        for path in sorted(p for p in self.images.iterdir() if p.suffix.lower() in ENDINGS):
+            by_name.setdefault(path.stem, []).append(path)
+        missing = [test.stem for test in tests if test.stem not in by_name]
+        if missing:
+            first_there = next(iter(by_name.values()), [None])[0]
+            there = f"the first image there is {first_there.name}" if first_there else "no image is there"
+            raise ValueError(
+                f"{self.images} lacks {len(missing)} of {len(tests)} test images, {missing[0]}.png to begin with "
+                f"({there}): name each rendering as its test image."
+            )
+        for first, *others in (by_name[test.stem] for test in tests):
+            if others:
+                raise ValueError(f"{self.images} holds {first.name} and {others[0].name}: keep one of them.")
         metrics = ImageMetrics(self.lpips)
         scores: Scores = []
-        for i, file in zip(chosen, files, strict=True):
+        for i, (file, *_) in zip(chosen, (by_name[test.stem] for test in tests), strict=True):
             truth, name = truths.get_data(i)["image"], truths.image_filenames[i]
             if truth.shape[-1] != 3:
                 raise ValueError(f"{name} is see-through: there is no one truth to compare with.")
@@ -91,23 +107,3 @@ def evenly(count: int, most: int) -> list[int]:
     if most <= 0 or most >= count:
         return list(range(count))
     return [int((i + 0.5) * count / most) for i in range(most)]
-
-
-def find_renderings(folder: Path, tests: list[Path]) -> list[Path]:
-    """The rendering of each test image, in their order. Raises ValueError if one is missing, or there twice."""
-    if not folder.is_dir():
-        raise ValueError(f"There is no folder {folder}: give the one that holds the renderings.")
-    by_name: dict[str, list[Path]] = {}
-    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in ENDINGS):
-        by_name.setdefault(path.stem, []).append(path)
-    missing = [test.stem for test in tests if test.stem not in by_name]
-    if missing:
-        there = f"the first image there is {next(iter(by_name.values()))[0].name}" if by_name else "no image is there"
-        raise ValueError(
-            f"{folder} lacks {len(missing)} of {len(tests)} test images, {missing[0]}.png to begin with ({there}): "
-            "name each rendering as its test image."
-        )
-    for first, *others in (by_name[test.stem] for test in tests):
-        if others:
-            raise ValueError(f"{folder} holds {first.name} and {others[0].name}: keep one of them.")
-    return [by_name[test.stem][0] for test in tests]

@@ -52,43 +52,35 @@ def continued(depths: Map, directions: Map) -> Map:
     parts = [trust, trust * q * q, *(trust * q * axis for axis in v)]
     parts += [trust * v[i] * v[j] for i in range(3) for j in range(i, 3)]
     height, width = inverse.shape
-    for share in WIDTHS:
-        # Sums under a wide Gaussian, zero outside, from smaller images.
+    for share in WIDTHS:  # sums under a wide Gaussian, zero outside, from smaller images
         shrink = max(1.0, share * max(height, width) / PIXELS)
-        size, sums = (max(1, round(width / shrink)), max(1, round(height / shrink))), []
+        blur, sums = share * max(height, width) / shrink, []
         for part in parts:
+            size = max(1, round(width / shrink)), max(1, round(height / shrink))
             small = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
-            deviation = share * max(height, width) / shrink
-            small = cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_CONSTANT)
+            small = cv2.GaussianBlur(small, (0, 0), blur, borderType=cv2.BORDER_CONSTANT)
             sums.append(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
         rows, columns = np.nonzero((sums[0] > ENOUGH) & (best > LEAST_ERROR))
-        value, deviation = _planes([s[rows, columns] for s in sums], [axis[rows, columns] for axis in v])
+        # w.v is fitted to q along v; its expected error is the scatter, larger the farther extrapolated.
+        sums, sight = [s[rows, columns] for s in sums], [axis[rows, columns] for axis in v]
+        _, squares, *right, xx, xy, xz, yy, yz, zz = (s / sums[0] for s in sums)
+        xx, yy, zz = xx + 1e-7, yy + 1e-7, zz + 1e-7
+        # In closed form, part by part: LAPACK takes matrices one by one, and NumPy is slow along short axes.
+        cofactors = (
+            (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy),
+            (xz * yz - xy * zz, xx * zz - xz * xz, xy * xz - xx * yz),
+            (xy * yz - xz * yy, xy * xz - xx * yz, xx * yy - xy * xy),
+        )
+        determinant = xx * cofactors[0][0] + xy * cofactors[0][1] + xz * cofactors[0][2]
+        plane, spread = ([_dot(row, vector) / determinant for row in cofactors] for vector in (right, sight))
+        scatter, value = np.maximum(squares - _dot(plane, right), 0), _dot(plane, sight)
+        deviation = np.sqrt((scatter + (0.2 * LEAST_ERROR * value) ** 2) * np.maximum(_dot(spread, sight), 1))
         relative = np.where(value > 0, np.maximum(deviation / np.maximum(value, 1e-12), LEAST_ERROR), np.inf)
         good = relative < best[rows, columns]
         rows, columns, value, relative = rows[good], columns[good], value[good], relative[good]
         best[rows, columns] = relative
         extended[rows, columns] = scale * np.stack([value, relative * value], -1)
     return extended
-
-
-def _planes(
-    sums: Sequence[NDArray[np.float64]], directions: Sequence[NDArray[np.float64]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of w.v fitted to pixels by sums [P] of weights, w q^2, w q v (3) and w v v^T (6): q along directions,
-    their three parts [P], and its expected error, the scatter about the plane, larger the farther extrapolated."""
-    _, squares, *right, xx, xy, xz, yy, yz, zz = (part / sums[0] for part in sums)
-    xx, yy, zz = xx + 1e-7, yy + 1e-7, zz + 1e-7
-    # In closed form, part by part: LAPACK takes matrices one by one, and NumPy is slow along short axes.
-    cofactors = (
-        (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy),
-        (xz * yz - xy * zz, xx * zz - xz * xz, xy * xz - xx * yz),
-        (xy * yz - xz * yy, xy * xz - xx * yz, xx * yy - xy * xy),
-    )
-    determinant = xx * cofactors[0][0] + xy * cofactors[0][1] + xz * cofactors[0][2]
-    plane, spread = ([_dot(row, vector) / determinant for row in cofactors] for vector in (right, directions))
-    scatter, value = np.maximum(squares - _dot(plane, right), 0), _dot(plane, directions)
-    leverage = np.maximum(_dot(spread, directions), 1)
-    return value, np.sqrt((scatter + (0.2 * LEAST_ERROR * value) ** 2) * leverage)
 
 
 def _dot(a: Sequence[NDArray[np.float64]], b: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

@@ -70,7 +70,43 @@ def checked_model(path: Path) -> Iterator[None]:
     """Checks the files of a model, and turns any error while reading it into one InputError."""
     try:
         if all((path / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")):
-            _check_binary_files(path)
+            # pycolmap trusts the counts in the files (https://colmap.github.io/format.html): where one is truncated or
+            # names a missing record, it would allocate gigabytes or end the process.
+            sizes = {"cameras": 24, "images": 73, "points3D": 51}
+            files = [_Reader(f"{name}.bin", (path / f"{name}.bin").read_bytes()) for name in sizes]
+            records = [file.count(least) for file, least in zip(files, sizes.values(), strict=True)]
+            cameras, images, points, seen = set(), {}, set(), [np.array([NO_POINT])]
+            for _ in range(records[0]):
+                number, model, _, _ = files[0].take("<IiQQ")
+                if not 0 <= model < len(PARAMETERS):
+                    raise ValueError(f"cameras.bin has a camera of model {model}, which is not known")
+                files[0].take(f"{8 * PARAMETERS[model]}x")
+                cameras.add(number)
+            for _ in range(records[1]):
+                number, *_, camera = files[1].take("<I7dI")
+                if camera not in cameras:
+                    raise ValueError(f"images.bin names camera {camera}, which cameras.bin has not")
+                end = files[1].data.find(b"\0", files[1].at)
+                if end < 0:
+                    raise ValueError("images.bin ends within a name")
+                files[1].at = end + 1
+                images[number] = files[1].count(24)
+                begin, _ = files[1].at, files[1].take(f"{24 * images[number]}x")
+                seen.append(np.frombuffer(files[1].data, KEYPOINT, images[number], begin)["point"])
+            for _ in range(records[2]):
+                points.add(files[2].take("<Q3d3Bd")[0])
+                (track,) = files[2].take(f"{8 * files[2].count(8)}s")
+                for image, keypoint in struct.iter_unpack("<II", track):
+                    if keypoint >= images.get(image, 0):
+                        raise ValueError(
+                            f"points3D.bin names keypoint {keypoint} of image {image}, which images.bin has not"
+                        )
+            for file in files:
+                if file.at != len(file.data):
+                    raise ValueError(f"{file.name} has {len(file.data) - file.at} bytes too many")
+            lost = set(np.unique(np.concatenate(seen)).tolist()) - {int(NO_POINT)} - points
+            if lost:
+                raise ValueError(f"images.bin names point {min(lost)}, which points3D.bin has not")
         yield
     except (ValueError, RuntimeError, OSError, LookupError, MemoryError, AssertionError, struct.error) as error:
         raise InputError(f"The COLMAP model in {path} cannot be read ({brief(error)}): repair or remove it.") from error
@@ -152,44 +188,6 @@ class _Reader:
         if number * least > len(self.data) - self.at:
             raise ValueError(f"{self.name} says it has {number} records and has room for fewer")
         return number
-
-
-def _check_binary_files(folder: Path) -> None:
-    """Raises ValueError where a binary file (https://colmap.github.io/format.html) is truncated or names a missing
-    record: pycolmap trusts the counts in the files, and would allocate gigabytes or end the process."""
-    sizes = {"cameras": 24, "images": 73, "points3D": 51}
-    files = [_Reader(f"{name}.bin", (folder / f"{name}.bin").read_bytes()) for name in sizes]
-    records = [file.count(least) for file, least in zip(files, sizes.values(), strict=True)]
-    cameras, images, points, seen = set(), {}, set(), [np.array([NO_POINT])]
-    for _ in range(records[0]):
-        number, model, _, _ = files[0].take("<IiQQ")
-        if not 0 <= model < len(PARAMETERS):
-            raise ValueError(f"cameras.bin has a camera of model {model}, which is not known")
-        files[0].take(f"{8 * PARAMETERS[model]}x")
-        cameras.add(number)
-    for _ in range(records[1]):
-        number, *_, camera = files[1].take("<I7dI")
-        if camera not in cameras:
-            raise ValueError(f"images.bin names camera {camera}, which cameras.bin has not")
-        end = files[1].data.find(b"\0", files[1].at)
-        if end < 0:
-            raise ValueError("images.bin ends within a name")
-        files[1].at = end + 1
-        images[number] = files[1].count(24)
-        begin, _ = files[1].at, files[1].take(f"{24 * images[number]}x")
-        seen.append(np.frombuffer(files[1].data, KEYPOINT, images[number], begin)["point"])
-    for _ in range(records[2]):
-        points.add(files[2].take("<Q3d3Bd")[0])
-        (track,) = files[2].take(f"{8 * files[2].count(8)}s")
-        for image, keypoint in struct.iter_unpack("<II", track):
-            if keypoint >= images.get(image, 0):
-                raise ValueError(f"points3D.bin names keypoint {keypoint} of image {image}, which images.bin has not")
-    for file in files:
-        if file.at != len(file.data):
-            raise ValueError(f"{file.name} has {len(file.data) - file.at} bytes too many")
-    lost = set(np.unique(np.concatenate(seen)).tolist()) - {int(NO_POINT)} - points
-    if lost:
-        raise ValueError(f"images.bin names point {min(lost)}, which points3D.bin has not")
 
 
 @contextmanager

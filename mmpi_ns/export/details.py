@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
 from torch.nn.functional import interpolate
 
 from mmpi_ns.rendering.details import DetailView
@@ -57,19 +56,11 @@ def stored_view(view: DetailView) -> StoredView:
     most = max(float(inverse.max()), 1e-12)
     depths = torch.where(inverse < 0, 0, 1 + (254 * (inverse.clamp(min=0) / most).sqrt()).round())
     colours = (ZERO + planes[0].movedim(0, -1) / STEP).round().clamp(0, 255)
-    return StoredView(
-        tuple(float(f"{x:.8g}") for x in camera.tolist()),
-        (width, height),
-        most,
-        _webp(colours, quality=QUALITY),
-        _webp(depths, lossless=True),
-    )
-
-
-def _webp(codes: Tensor, **how: int) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(codes.to(torch.uint8).cpu().numpy()).convert("RGB").save(file, "WEBP", method=6, **how)
-    return file.getvalue()
+    files = io.BytesIO(), io.BytesIO()
+    for file, codes, how in zip(files, (colours, depths), ({"quality": QUALITY}, {"lossless": True}), strict=True):
+        Image.fromarray(codes.to(torch.uint8).cpu().numpy()).convert("RGB").save(file, "WEBP", method=6, **how)
+    numbers = tuple(float(f"{x:.8g}") for x in camera.tolist())
+    return StoredView(numbers, (width, height), most, *(file.getvalue() for file in files))
 
 
 def restored_view(view: StoredView, device: torch.device) -> DetailView:

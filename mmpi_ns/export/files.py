@@ -299,24 +299,14 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, Baked
     nears = {"ray_near": row["ray_near"], "content_near": row["content_near"]}
     plan = ScenePlan.from_object({"mpis": mpi_rows, "cube": None, "origin_of_plan": "baked", **nears})
     radius = math.inf if row["radius"] is None else row["radius"]
-    return (Window(tuple(row["center"]), radius, row["margin"], plan), _window_of(row, plan.mpis, arrays)), views
-
-
-def _window_of(row: dict[str, Any], mpis: tuple[MPIPlan, ...], arrays: dict[str, NDArray[Any]]) -> BakedWindow:
-    """A window from its part of the header and what ``_arrays`` gave."""
     masks, early_masks = (torch.from_numpy(arrays[name].view(np.int32)) for name in ("columns", "early_columns"))
     early = bits_of(early_masks)[bits_of(masks) > 0] > 0
     decoded = row | {f"{name}_array": array for name, array in arrays.items()}
     codes = torch.from_numpy(reader.decode(decoded)).view(-1, len(early), SIDE, SIDE)
-    baked = BakedMpis(
-        mpis,
-        tuple(m["interval"] for m in row["mpis"]),
-        torch.from_numpy(decoded["columns_array"].astype(np.int32)),
-        codes[0],
-        codes[1:].movedim(0, -1).contiguous(),
-        Codes(**row["density"]),
-        tuple(Codes(**c) for c in row["channels"]),
-    )
+    columns = torch.from_numpy(decoded["columns_array"].astype(np.int32))
+    intervals, channels = tuple(m["interval"] for m in row["mpis"]), tuple(Codes(**c) for c in row["channels"])
+    tables = columns, codes[0], codes[1:].movedim(0, -1).contiguous()
+    baked = BakedMpis(plan.mpis, intervals, *tables, Codes(**row["density"]), channels)
     layers, numbers, start = [], torch.from_numpy(arrays["network"]).float(), 0
     for outputs, inputs in row["shader"]["layers"]:
         weights, biases = numbers[start : start + outputs * inputs], numbers[start + outputs * inputs :][:outputs]
@@ -325,4 +315,5 @@ def _window_of(row: dict[str, Any], mpis: tuple[MPIPlan, ...], arrays: dict[str,
     shader = Shader(tuple(layers), row["shader"]["direction_octaves"], row["shader"]["bound"])
     exposure = tuple(row.get("exposure", (1.0, 1.0, 1.0)))  # before images were shown at one exposure
     near, far = row["ray_near"], row["farthest"]
-    return BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure, early.float())
+    baked_window = BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure, early.float())
+    return (Window(tuple(row["center"]), radius, row["margin"], plan), baked_window), views

@@ -108,7 +108,35 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
     heaviest = weight.argsort(descending=True)[:most].sort().values
     numbers = torch.full((len(weight),), -1).index_copy(0, heaviest, torch.arange(len(heaviest)))
     group = torch.where(is_seen, numbers[group.clamp(min=0)], -1)
-    splats = _placed(window, texels, group, level, fmean(pose.focal[0] for pose in poses))
+    focal = fmean(pose.focal[0] for pose in poses)
+    inside = (group >= 0).nonzero()[:, 0]
+    group, level, total = group[inside], level[inside], int(group.max()) + 1
+    count = torch.bincount(group, minlength=total).float()
+    values = torch.cat([texels.places[:, 2:].float(), texels.depths[:, None], texels.channels[:, :COLORS]], -1)[inside]
+    average = torch.zeros(total, values.shape[1]).index_add(0, group, values) / count[:, None]
+    (y, x, depth), colors = average[:, :3].unbind(-1), average[:, 3:]
+    first = torch.empty_like(count, dtype=torch.int64).index_copy(0, group, inside)
+    head, plane = texels.places[first, :2].unbind(-1)
+    size = 2.0 ** torch.empty_like(first).index_copy(0, group, level)
+    means, scales = torch.empty(total, 3), torch.empty(total, 3)
+    rotations, alphas = torch.empty(total, 4), torch.empty(total)
+    for k, mpi in enumerate(window.mpis.mpis):
+        in_mpi = head == k
+        u0, u1, v0, v1 = mpi.extent
+        du, dv = (u1 - u0) / (mpi.width - 1), (v1 - v0) / (mpi.height - 1)
+        disparity = (mpi.planes - 1 - plane[in_mpi]) * mpi.disparity_step + 1 / mpi.far
+        z = 1 / disparity.clamp(min=1 / window.farthest)
+        local = torch.stack([(u0 + x[in_mpi] * du) * z, (v0 + y[in_mpi] * dv) * z, z], -1)
+        means[in_mpi] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)
+        sides = torch.stack([size[in_mpi] * du, size[in_mpi] * dv], -1)
+        scales[in_mpi] = torch.cat([WIDTH * sides, THICKNESS * sides[:, :1]], -1) * z[:, None]
+        qx, qy, qz, qw = Rotation.from_matrix(np.transpose(mpi.axes)).as_quat()
+        rotations[in_mpi] = torch.tensor([qw, qx, qy, qz], dtype=torch.float32)
+        # Overlapping splats of this spacing sum to this multiple of their centre value, after a rasteriser's blur.
+        overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
+        alphas[in_mpi] = -torch.expm1(-DENSER * depth[in_mpi] / overlap)
+    colors = torch.cat([colors[:, None], torch.zeros(total, 3, COLORS)], 1)
+    splats = Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
     for number in range(rounds):  # other cameras each time, so that splats do not overfit to those of the capture
         cameras = between(poses, FRACTIONS[number % len(FRACTIONS)])
         splats = fitted(splats, window, track(cameras, description=f"Fitting splats, round {number + 1} of {rounds}"))
@@ -205,38 +233,6 @@ def _merged(texels: _Texels, is_seen: Bool[Tensor, "T"]) -> tuple[Int[Tensor, "T
     groups, levels = torch.full(is_seen.shape, -1), torch.zeros(is_seen.shape, dtype=torch.int64)
     groups[is_seen], levels[is_seen] = group, level
     return groups, levels
-
-
-def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, focal: float) -> Splats:
-    """Positions, sizes, opacities and diffuse colours of splats."""
-    inside = (group >= 0).nonzero()[:, 0]
-    group, level, total = group[inside], level[inside], int(group.max()) + 1
-    count = torch.bincount(group, minlength=total).float()
-    values = torch.cat([texels.places[:, 2:].float(), texels.depths[:, None], texels.channels[:, :COLORS]], -1)[inside]
-    average = torch.zeros(total, values.shape[1]).index_add(0, group, values) / count[:, None]
-    (y, x, depth), colors = average[:, :3].unbind(-1), average[:, 3:]
-    first = torch.empty_like(count, dtype=torch.int64).index_copy(0, group, inside)
-    head, plane = texels.places[first, :2].unbind(-1)
-    size = 2.0 ** torch.empty_like(first).index_copy(0, group, level)
-    means, scales = torch.empty(total, 3), torch.empty(total, 3)
-    rotations, alphas = torch.empty(total, 4), torch.empty(total)
-    for k, mpi in enumerate(window.mpis.mpis):
-        in_mpi = head == k
-        u0, u1, v0, v1 = mpi.extent
-        du, dv = (u1 - u0) / (mpi.width - 1), (v1 - v0) / (mpi.height - 1)
-        disparity = (mpi.planes - 1 - plane[in_mpi]) * mpi.disparity_step + 1 / mpi.far
-        z = 1 / disparity.clamp(min=1 / window.farthest)
-        local = torch.stack([(u0 + x[in_mpi] * du) * z, (v0 + y[in_mpi] * dv) * z, z], -1)
-        means[in_mpi] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)
-        sides = torch.stack([size[in_mpi] * du, size[in_mpi] * dv], -1)
-        scales[in_mpi] = torch.cat([WIDTH * sides, THICKNESS * sides[:, :1]], -1) * z[:, None]
-        qx, qy, qz, qw = Rotation.from_matrix(np.transpose(mpi.axes)).as_quat()
-        rotations[in_mpi] = torch.tensor([qw, qx, qy, qz], dtype=torch.float32)
-        # Overlapping splats of this spacing sum to this multiple of their centre value, after a rasteriser's blur.
-        overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
-        alphas[in_mpi] = -torch.expm1(-DENSER * depth[in_mpi] / overlap)
-    colors = torch.cat([colors[:, None], torch.zeros(total, 3, COLORS)], 1)
-    return Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
 
 
 def write_ply(splats: Splats, path: Path) -> int:

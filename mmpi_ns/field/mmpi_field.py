@@ -261,7 +261,16 @@ class MMPIField(TexelTables):
         total, features = self.density.new_zeros(()), lookup.features
         if chroma_times > 0 and features.requires_grad:
             features = features.view_as(features)  # a node of its own: the hook sees this loss's gradient alone
-            features.register_hook(lambda gradient: with_chroma(gradient, chroma_times))
+            # Chroma is three colours less their mean.
+            features.register_hook(
+                lambda gradient: torch.cat(
+                    [
+                        (colors := gradient[:, :COLORS]) + chroma_times * (colors - colors.mean(-1, keepdim=True)),
+                        gradient[:, COLORS:],
+                    ],
+                    -1,
+                )
+            )
         if (scales := self.cached("resolution")) is None:
             longest = ((max(grid.width, grid.height), grid) for grid in self.grids)
             sides = [(g.width, g.height, g.depth) if g.is_cube else (side, side, g.depth) for side, g in longest]
@@ -281,13 +290,6 @@ class MMPIField(TexelTables):
         local = geometry.LocalRays.of(rays.origins.detach(), rays.directions.detach(), self.layout.frames)
         places = (lookup.rays, local, samples.inverse_t.reshape(-1)[lookup.index], lookup.heads)
         return log_shares(self.layout, self.reliability, self.touched, *places)
-
-
-def with_chroma(gradient: Float[Tensor, "U C"], times: float) -> Float[Tensor, "U C"]:
-    """A gradient of features, its chroma (three colours less their mean) ``times`` times more in it."""
-    colors = gradient[:, :COLORS]
-    chroma = colors - colors.mean(-1, keepdim=True)
-    return torch.cat([colors + times * chroma, gradient[:, COLORS:]], -1)
 
 
 def moving(

@@ -322,8 +322,29 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     disparities = np.linspace(0, 0.35 * width / (fx * baseline), HYPOTHESES)
     # Of each disparity the mean correlation of the better half of the neighbours.
     better = max(1, (len(neighbours) + 1) // 2)
-    correlations = ([_correlation(reference, n, rays, w) for n in neighbours] for w in disparities)
-    scores = np.stack([np.sort(np.stack(c), 0)[::-1][:better].mean(0) for c in correlations])
+    scores = []
+    for disparity in disparities:
+        correlations = []  # zero-mean and normalised, over windows; -1 where one leaves the neighbour or has no texture
+        for neighbour in neighbours:
+            direction = rays @ reference.pose[:, :3].T + disparity * (reference.pose[:, 3] - neighbour.pose[:, 3])
+            local = direction @ neighbour.pose[:, :3]
+            depth = -local[..., 2]
+            ahead = depth > 1e-9
+            safe = np.where(ahead, depth, 1.0)
+            fx, fy, cx, cy = neighbour.intrinsics
+            x, y = fx * local[..., 0] / safe + cx - 0.5, -fy * local[..., 1] / safe + cy - 0.5
+            height, width = neighbour.image.shape
+            inside = ahead & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+            a, b = reference.image, map_coordinates(neighbour.image, np.where(inside, [y, x], 0.0), order=1)
+            b, mean = np.where(inside, b, 0.0), partial(uniform_filter, size=WINDOW, mode="nearest")
+            mean_a, mean_b = mean(a), mean(b)
+            variance_a, variance_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+            covariance = mean(a * b) - mean_a * mean_b
+            textured = (variance_a > 1e-4) & (variance_b > 1e-4) & (mean(inside.astype(float)) > 0.999)
+            correlation = np.where(textured, covariance / np.sqrt(np.maximum(variance_a * variance_b, 1e-12)), -1.0)
+            correlations.append(correlation)
+        scores.append(np.sort(np.stack(correlations), 0)[::-1][:better].mean(0))
+    scores = np.stack(scores)
     best = scores.argmax(0)
     top = scores.max(0)
     level = np.arange(HYPOTHESES)[:, None, None]
@@ -338,24 +359,3 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     inverse_depth = np.where(good, (best + offset) * disparities[1], 1.0)
     world = (rays / inverse_depth[..., None]) @ reference.pose[:, :3].T + reference.pose[:, 3]
     return world[good][:: max(1, good.sum() // 400)]
-
-
-def _correlation(reference: _View, neighbour: _View, rays: Array, disparity: float) -> Array:
-    """Zero-mean normalised correlation, over windows, of the reference with the neighbour warped at a disparity; -1
-    where a window leaves the neighbour or holds no texture."""
-    direction = rays @ reference.pose[:, :3].T + disparity * (reference.pose[:, 3] - neighbour.pose[:, 3])
-    local = direction @ neighbour.pose[:, :3]
-    depth = -local[..., 2]
-    ahead = depth > 1e-9
-    safe = np.where(ahead, depth, 1.0)
-    fx, fy, cx, cy = neighbour.intrinsics
-    x, y = fx * local[..., 0] / safe + cx - 0.5, -fy * local[..., 1] / safe + cy - 0.5
-    height, width = neighbour.image.shape
-    inside = ahead & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    a, b = reference.image, map_coordinates(neighbour.image, np.where(inside, [y, x], 0.0), order=1)
-    b, mean = np.where(inside, b, 0.0), partial(uniform_filter, size=WINDOW, mode="nearest")
-    mean_a, mean_b = mean(a), mean(b)
-    variance_a, variance_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
-    covariance = mean(a * b) - mean_a * mean_b
-    textured = (variance_a > 1e-4) & (variance_b > 1e-4) & (mean(inside.astype(float)) > 0.999)
-    return np.where(textured, covariance / np.sqrt(np.maximum(variance_a * variance_b, 1e-12)), -1.0)

@@ -84,9 +84,28 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     """The scene plan for some training cameras and what they saw. Texels are no finer than the pixel rays of the whole
     training can train, if known. Raises ValueError if all observations are behind their cameras."""
     visible = find_visible_points(observations)
-    if config.arrangement != "automatic":
-        arrange = _drive if config.arrangement == "drive" else _room
-        return arrange(observations, visible.near, config)
+    if config.arrangement == "room":
+        return _room(observations, visible.near, config)
+    if config.arrangement == "drive":  # some of four MPIs along a straight drive, placed by hand in metres
+        metre = visible.near / 5  # the rule was made where the nearest point lies 5 m away
+        base = observations.mean_axes
+        centers = observations.centers @ base.T
+        start = np.array([centers[:, 0].mean(), centers[:, 1].mean(), centers[:, 2].min()])
+        travel = float(np.ptp(centers[:, 2])) / metre
+        back = config.drive_pull_back * travel
+        # origin (right, down, forward) in metres from the first camera, near, tangents along the MPI's own x and y
+        rule = {
+            "front": ((0.0, 0.0, -back), back + 3, (-1.0, 1.0, -0.35, 0.35)),
+            "left": ((8.0, 0.0, travel / 2), 10.0, (-2.5, 9.0, -0.7, 0.4)),
+            "right": ((-8.0, 0.0, travel / 2), 10.0, (-9.0, 2.5, -0.7, 0.4)),
+            "below": ((0.0, -4.0, travel / 2), 4.8, (-6.0, 6.0, -18.0, 6.0)),
+        }
+        mpis, size = [], (config.planes, config.height, config.width)
+        for name in config.faces:
+            origin, near, extent = rule[name]
+            world = (start + np.array(origin) * metre) @ base
+            mpis.append(MPIPlan(name, vector(world), facing_axes(base, name), near * metre, extent, *size))
+        return ScenePlan(tuple(mpis), None, 1.0 * metre, 5.0 * metre, "hand-made drive")
     trainable, budget = texel_limits(observations, visible, config, training_rays)
     finest = max(config.texel_pixels, trainable)
     chosen, texel_pixels = _choose(observations, visible, replace(config, max_texels=budget), finest)
@@ -103,29 +122,6 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
     mpis = tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))  # two may be placed at one camera
     return ScenePlan(mpis, cube, 0.2 * visible.near, visible.near, origin, detail)
-
-
-def _drive(observations: Observations, content_near: float, config: PlacementConfig) -> ScenePlan:
-    """Some of four MPIs along a straight drive in the cameras' mean direction, placed by hand in metres."""
-    metre = content_near / 5  # the rule was made where the nearest point lies 5 m away
-    base = observations.mean_axes
-    centers = observations.centers @ base.T
-    start = np.array([centers[:, 0].mean(), centers[:, 1].mean(), centers[:, 2].min()])
-    travel = float(np.ptp(centers[:, 2])) / metre
-    back = config.drive_pull_back * travel
-    # origin (right, down, forward) in metres from the first camera, near, tangents along the MPI's own x and y
-    rule = {
-        "front": ((0.0, 0.0, -back), back + 3, (-1.0, 1.0, -0.35, 0.35)),
-        "left": ((8.0, 0.0, travel / 2), 10.0, (-2.5, 9.0, -0.7, 0.4)),
-        "right": ((-8.0, 0.0, travel / 2), 10.0, (-9.0, 2.5, -0.7, 0.4)),
-        "below": ((0.0, -4.0, travel / 2), 4.8, (-6.0, 6.0, -18.0, 6.0)),
-    }
-    mpis, size = [], (config.planes, config.height, config.width)
-    for name in config.faces:
-        origin, near, extent = rule[name]
-        world = (start + np.array(origin) * metre) @ base
-        mpis.append(MPIPlan(name, vector(world), facing_axes(base, name), near * metre, extent, *size))
-    return ScenePlan(tuple(mpis), None, 1.0 * metre, 5.0 * metre, "hand-made drive")
 
 
 def _room(observations: Observations, content_near: float, config: PlacementConfig) -> ScenePlan:

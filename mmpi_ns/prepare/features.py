@@ -170,20 +170,17 @@ def choose_pairs(
     says = f"{matching} ({why})"
     if matching == "exhaustive":
         return [(i, j) for i in range(count) for j in range(i + 1, count)], says
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    usable, number = apart > 0, LOOK_ALIKES
+    if matching != "retrieval":  # pairs that may show a place again: as similar as images a few frames apart
+        edge = alike[apart == min(overlap, count - 1)]
+        usable = (apart > max(FAR_STEPS[-1], overlap)) & (alike >= np.percentile(edge, 25))
+        number = REVISITS
+    alike = np.where(usable, alike, -np.inf)
+    order = np.argsort(-alike, axis=-1, kind="stable")[:, :number]
+    some = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row if alike[i, j] > -1e9}
     if matching == "retrieval":
-        return _look_alikes(alike, LOOK_ALIKES), says
+        return sorted(some), says
     steps = [*range(1, overlap + 1), *(s for s in FAR_STEPS if s > overlap)]
     near = {(i, i + s) for s in steps for i in range(count - s)}
-    # Pairs that may show a place again: as similar as images a few frames apart.
-    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
-    edge = alike[apart == min(overlap, count - 1)]
-    usable = (apart > max(FAR_STEPS[-1], overlap)) & (alike >= np.percentile(edge, 25))
-    revisits = _look_alikes(np.where(usable, alike, -np.inf), REVISITS)
-    return sorted(near.union(revisits)), f"{says}, {len(revisits)} pairs that may be revisits"
-
-
-def _look_alikes(alike: NDArray[np.float32], number: int) -> Pairs:
-    """Pairs of each image and the images most similar to it; infinite similarities do not count."""
-    alike = np.where(np.eye(len(alike), dtype=bool), -np.inf, alike)
-    order = np.argsort(-alike, axis=-1, kind="stable")[:, :number]
-    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row if alike[i, j] > -1e9})
+    return sorted(near | some), f"{says}, {len(some)} pairs that may be revisits"

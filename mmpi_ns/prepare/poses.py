@@ -112,8 +112,29 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
     """Reads known poses, a file or a folder of 4x4 text files, and matches them with the images. Raises InputError if
     they are not understood, or fit fewer than two images."""
     is_transforms = path.suffix.lower() == ".json"
-    reader = _read_transforms if is_transforms else _read_matrices if path.is_dir() else _read_lines
-    read = reader(path, photos)
+    if is_transforms or not path.is_dir():
+        read = (_read_transforms if is_transforms else _read_lines)(path, photos)
+    else:  # one text file for each image, by name, else in order
+        files = [p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")]
+        files.sort(key=lambda p: natural_key(p.name))
+        by_stem = {KIND.sub("", p.stem): p for p in files if p.is_file()}
+        chosen = {p.name: by_stem[stem] for p in photos if (stem := KIND.sub("", Path(p.source).stem)) in by_stem}
+        says = "4x4 matrices, by name"
+        if len(chosen) < 2:
+            if len(files) != len(photos):
+                raise InputError(f"{path} has {len(files)} files for {len(photos)} images, and the names do not match.")
+            chosen, says = {p.name: f for p, f in zip(photos, files, strict=True)}, "4x4 matrices, in order"
+        _check_apart(chosen, path)
+        poses = {}
+        for name, file in chosen.items():
+            try:
+                matrix = np.loadtxt(file, dtype=np.float64)
+            except ValueError as error:
+                raise InputError(f"{file} cannot be read ({error}).") from error
+            if matrix.shape not in ((4, 4), (3, 4)):
+                raise InputError(f"{file} is {matrix.shape}, not 4x4.")
+            poses[name] = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
+        read = KnownPoses(poses, says)
     opengl = axes == "opengl" or (axes == "auto" and is_transforms)
     flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
     poses = {n: p @ flip for n, p in read.poses.items() if np.isfinite(p).all()}
@@ -178,30 +199,6 @@ def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
             f"{path} has {len(rows)} poses for {len(photos)} images, and the images' names are not their time stamps."
         )
     return KnownPoses({p.name: pose for p, pose in zip(photos, poses, strict=True)}, f"TUM poses, {says}")
-
-
-def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """4x4 matrices: one text file for each image, by name, else in order."""
-    files = [p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")]
-    files.sort(key=lambda p: natural_key(p.name))
-    by_stem = {KIND.sub("", p.stem): p for p in files if p.is_file()}
-    chosen = {p.name: by_stem[stem] for p in photos if (stem := KIND.sub("", Path(p.source).stem)) in by_stem}
-    says = "4x4 matrices, by name"
-    if len(chosen) < 2:
-        if len(files) != len(photos):
-            raise InputError(f"{path} has {len(files)} files for {len(photos)} images, and the names do not match.")
-        chosen, says = {p.name: f for p, f in zip(photos, files, strict=True)}, "4x4 matrices, in order"
-    _check_apart(chosen, path)
-    poses = {}
-    for name, file in chosen.items():
-        try:
-            matrix = np.loadtxt(file, dtype=np.float64)
-        except ValueError as error:
-            raise InputError(f"{file} cannot be read ({error}).") from error
-        if matrix.shape not in ((4, 4), (3, 4)):
-            raise InputError(f"{file} is {matrix.shape}, not 4x4.")
-        poses[name] = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
-    return KnownPoses(poses, says)
 
 
 def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:

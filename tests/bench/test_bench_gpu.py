@@ -75,7 +75,11 @@ def test_a_full_look_tries_every_shape_afresh(monkeypatch, tmp_path):
     monkeypatch.setattr(
         dispatch, "fault", lambda name: "wrong" if tried[-1][0] == EVERY[0] and name == "march" else None
     )
-    found = command.try_operations("cuda", EVERY)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(command, "environment", dict)
+    monkeypatch.setattr(command, "time_training", lambda *_: TIMED)
+    command.Gpu(folder=tmp_path).main()
+    found = json.loads((tmp_path / "gpu.json").read_text())["operations"]
     assert tried == [(shapes, True) for shapes in EVERY] and len(found) == 4
     assert {name for name, reason in found.items() if reason} == {"march"}, "what failed once has failed"
     assert {1, 2, 5, 9, 33} <= set(EVERY[0].mpis) and EVERY[0].blends

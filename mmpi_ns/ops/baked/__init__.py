@@ -92,38 +92,34 @@ def shade_baked(
     return torch.from_numpy(reader.shade(window, mean, directions.double().numpy())).to(gathered)
 
 
-def _pack(baked: BakedMpis) -> ctypes.Array:
-    """A scene as the kernel reads it."""
-    count, bricks, channels = len(baked.mpis), baked.num_bricks, len(baked.channel_codes)
-    assert channels <= MOST_CHANNELS
-    codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
-    # Light that passes a sample of each MPI, at codes 0, 1/8, 2/8, ... 255.
-    through = [torch.exp(-baked.optical_depth(k, codes)).float().contiguous() for k in range(count)]
-    stacks = []
-    for k, mpi in enumerate(baked.mpis):
-        u0, u1, v0, v1 = mpi.extent
-        scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
-        sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], baked.first_column(k))
-        places = map(float, (mpi.disparity_step, 1 / mpi.far, u0, v0, *scales))
-        stacks.append((*places, *map(ctypes.c_int32, sizes)))
-    density = shaped(baked.density, bricks, SIDE, SIDE, dtype=torch.uint8)
-    texels = shaped(baked.texels, bricks, SIDE, SIDE, channels, dtype=torch.uint8)
-    low, step = (torch.tensor([getattr(c, name) for c in baked.channel_codes]) for name in ("low", "step"))
-    doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
-    tables = [
-        shaped(baked.columns, baked.first_column(count), 2, dtype=torch.int32),
-        # Sixteen channels are read at once, also those of the last texel, and four densities.
-        *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (density, texels)),
-        *(pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)),
-    ]
-    mpis = pad(frame_rows(Frames.pack(baked.mpis)), (0, 7))  # nothing is read of the rest of ``SceneLayout.constants``
-    return structs((count, channels, mpis, structs(*stacks), structs(through), *tables))
-
-
 @show_baked.on_cpu
 def show_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Tensor | None = None) -> Shown:
     if "cpu" not in scene.packed:
-        scene.packed["cpu"] = _pack(scene)
+        count, bricks, channels = len(scene.mpis), scene.num_bricks, len(scene.channel_codes)
+        assert channels <= MOST_CHANNELS
+        codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
+        # Light that passes a sample of each MPI, at codes 0, 1/8, 2/8, ... 255.
+        through = [torch.exp(-scene.optical_depth(k, codes)).float().contiguous() for k in range(count)]
+        stacks = []
+        for k, mpi in enumerate(scene.mpis):
+            u0, u1, v0, v1 = mpi.extent
+            scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
+            sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], scene.first_column(k))
+            places = map(float, (mpi.disparity_step, 1 / mpi.far, u0, v0, *scales))
+            stacks.append((*places, *map(ctypes.c_int32, sizes)))
+        density = shaped(scene.density, bricks, SIDE, SIDE, dtype=torch.uint8)
+        texels = shaped(scene.texels, bricks, SIDE, SIDE, channels, dtype=torch.uint8)
+        low, step = (torch.tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
+        doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
+        tables = [
+            shaped(scene.columns, scene.first_column(count), 2, dtype=torch.int32),
+            # Sixteen channels are read at once, also those of the last texel, and four densities.
+            *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (density, texels)),
+            *(pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)),
+        ]
+        # Nothing is read of the rest of ``SceneLayout.constants``.
+        mpis = pad(frame_rows(Frames.pack(scene.mpis)), (0, 7))
+        scene.packed["cpu"] = structs((count, channels, mpis, structs(*stacks), structs(through), *tables))
     if peaks is not None:
         assert dense(peaks)[0] is peaks, "peaks are written in place"
     walk = (scene.packed["cpu"], structs(dense_fields(rays)), float(threshold), peaks)

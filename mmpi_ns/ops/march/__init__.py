@@ -61,7 +61,25 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     tau = flat.tau
     if options.blends and tau.numel():
         local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
-        tau = _blend_visible(order, valid, flat, local, layout, tables)
+        tau = flat.tau.clone()
+        # Front to back until a ray lets less than exp(-OPAQUE_DEPTH) through. Reliability costs a lookup in every head,
+        # and most samples lie behind the first surface: those keep their own depth, which changes weights by less than
+        # that. Samples too thin to matter get an equal share without one.
+        passed = tau.new_zeros(order.shape[0])
+        for start in range(0, order.shape[1], BLEND_BLOCK):
+            block = order[:, start : start + BLEND_BLOCK]
+            visible = valid[:, start : start + BLEND_BLOCK] & (passed < OPAQUE_DEPTH)[:, None]
+            index = block[visible]
+            if not index.numel():
+                break
+            depth = flat.tau[index]
+            thick = (depth > NEGLIGIBLE).nonzero()[:, 0]
+            sample = index[thick]
+            places = (flat.rays[sample], local, flat.inverse_t[sample], flat.heads[sample])
+            shares = log_shares(layout, tables.reliability, tables.touched, *places)
+            blended = blended_optical_depth(depth[thick], *shares)
+            tau[index] = (depth / layout.num_heads).index_copy(0, thick, blended)
+            passed += torch.where(visible, tau[block], 0.0).sum(-1)
     order, valid, *skipped = prune(order, valid, tau, options.threshold, options.fair_share)
     order = torch.where(valid, order, len(tau))  # empty slots take the zeros behind the samples
     columns = (flat.heads, flat.planes, flat.ndc, flat.inverse_t, tau)
@@ -204,41 +222,6 @@ def merge(
     index[valid], keys[valid] = by_ray, inverse_t[by_ray]
     _, nearest = torch.sort(keys, dim=-1, descending=True, stable=True)
     return index.gather(-1, nearest), valid
-
-
-# Blend ---------------------------------------------------------------------------------------------------------------
-
-
-def _blend_visible(
-    order: Int[Tensor, "R S"],
-    valid: Bool[Tensor, "R S"],
-    flat: LiveSamples,
-    local: LocalRays,
-    layout: SceneLayout,
-    tables: Tables,
-) -> Float[Tensor, "N"]:
-    """Blended optical depths, front to back, until a ray lets less than exp(-OPAQUE_DEPTH) through.
-
-    Reliability costs a lookup in every head, and most samples lie behind the first surface: those keep their own depth,
-    which changes weights by less than exp(-OPAQUE_DEPTH). Samples too thin to matter get an equal share without one.
-    """
-    tau = flat.tau.clone()
-    passed = tau.new_zeros(order.shape[0])
-    for start in range(0, order.shape[1], BLEND_BLOCK):
-        block = order[:, start : start + BLEND_BLOCK]
-        visible = valid[:, start : start + BLEND_BLOCK] & (passed < OPAQUE_DEPTH)[:, None]
-        index = block[visible]
-        if not index.numel():
-            break
-        depth = flat.tau[index]
-        thick = (depth > NEGLIGIBLE).nonzero()[:, 0]
-        sample = index[thick]
-        places = (flat.rays[sample], local, flat.inverse_t[sample], flat.heads[sample])
-        shares = log_shares(layout, tables.reliability, tables.touched, *places)
-        blended = blended_optical_depth(depth[thick], *shares)
-        tau[index] = (depth / layout.num_heads).index_copy(0, thick, blended)
-        passed += torch.where(visible, tau[block], 0.0).sum(-1)
-    return tau
 
 
 # Prune ---------------------------------------------------------------------------------------------------------------
