@@ -79,8 +79,21 @@ def fit_memory(
         InputError: not enough memory is free.
     """
     attempts = 1
-    while short := _shortage(windows, views_of, work, device):
-        plan, needed, free = short
+    while True:
+        for window in windows.windows:
+            plan, seen = window.plan, views_of(window)
+            free, whole = free_memory(device) - reserved_bytes(plan, work, device), training_bytes(plan, None, work)
+            # To find the tiles in reach: marks, and the 4 side planes of every image at the tiles of one plane.
+            cameras = 0 if seen is None else len(seen.origins)
+            largest = max(-(-height // SIDE) * -(-width // SIDE) for _, height, width in head_shapes(plan))
+            looking = 8 * count_tiles(plan) + 4 * 8 * 3 * cameras * largest
+            needed = max(looking, int(LEAST_SHARE * whole))
+            if needed <= free < whole:
+                needed = training_bytes(plan, seen, work, device)
+            if needed > free:
+                break
+        else:
+            return windows
         most = 0.95 * plan.texels * max(0.0, free) / needed
         if again is None or most < SMALLEST_PLAN or attempts == ATTEMPTS:
             raise InputError(
@@ -93,27 +106,6 @@ def fit_memory(
             f"larger, {most / 1e6:.3g} M of them a window instead of {plan.texels / 1e6:.3g} M."
         )
         windows, attempts = again(most), attempts + 1
-    return windows
-
-
-def _shortage(
-    windows: WindowedPlan, views_of: Callable[[Window], TrainingViews | None], work: Work, device: str | torch.device
-) -> tuple[ScenePlan, float, float] | None:
-    """The first window that does not fit, the bytes that its tables need, and those that are free for them."""
-    for window in windows.windows:
-        plan, seen = window.plan, views_of(window)
-        free = free_memory(device) - reserved_bytes(plan, work, device)
-        everything = training_bytes(plan, None, work)
-        # To find the tiles in reach: marks, and the 4 side planes of every image at the tiles of one plane.
-        cameras = 0 if seen is None else len(seen.origins)
-        largest = max(-(-height // SIDE) * -(-width // SIDE) for _, height, width in head_shapes(plan))
-        looking = 8 * count_tiles(plan) + 4 * 8 * 3 * cameras * largest
-        needed = max(looking, int(LEAST_SHARE * everything))
-        if needed <= free < everything:
-            needed = training_bytes(plan, seen, work, device)
-        if needed > free:
-            return plan, needed, free
-    return None
 
 
 def reserved_bytes(plan: ScenePlan, work: Work, device: str | torch.device) -> int:

@@ -140,7 +140,15 @@ class MMPITrainer(Trainer):
             self._window_steps = model_config.total_steps = config.max_num_iterations
             model_config.method, self._follows_capture = config.method_name, config.max_num_iterations == 0
             model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
-            self._suit_device(model_config, config.pipeline.datamanager)
+            # More rays a step on a large GPU, in as many fewer steps, where neither was asked for.
+            manager: Any = config.pipeline.datamanager
+            method, rays = str(model_config.method), manager.train_num_rays_per_batch
+            asked = any(word.startswith("--pipeline.datamanager.train-num-rays-per-batch") for word in arguments())
+            may_change = self._follows_capture and not asked and str(self.device).startswith("cuda")
+            if may_change and rays == DEFAULTS[method].rays:
+                processors = torch.cuda.get_device_properties(self.device).multi_processor_count
+                model_config.rays_times = times = rays_times(method, processors)
+                manager.train_num_rays_per_batch, manager.keypoint_rays = times * rays, times * manager.keypoint_rays
             self._share: WindowShare | None = None
             if self.world_size > 1:
                 folders = [self.checkpoint_dir, *([config.load_dir] if config.load_dir else [])]
@@ -165,17 +173,6 @@ class MMPITrainer(Trainer):
                     f"The capture has {len(plan)} window(s), too few to share out among {self._share.processes} "
                     "processes: start fewer, or make windows shorter with --pipeline.model.placement.window-length."
                 )
-
-    def _suit_device(self, model_config: Any, manager: Any) -> None:
-        """Draws more rays a step on a large GPU, in as many fewer steps, where neither was asked for."""
-        asked = any(word.startswith("--pipeline.datamanager.train-num-rays-per-batch") for word in arguments())
-        if asked or not self._follows_capture or not str(self.device).startswith("cuda"):
-            return
-        method, rays = model_config.method, manager.train_num_rays_per_batch
-        if rays == DEFAULTS[method].rays:
-            processors = torch.cuda.get_device_properties(self.device).multi_processor_count
-            model_config.rays_times = times = rays_times(method, processors)
-            manager.train_num_rays_per_batch, manager.keypoint_rays = times * rays, times * manager.keypoint_rays
 
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""

@@ -8,9 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 from baked_details import detailed_scene, details_for, opaque_window, with_details
+from nerfstudio.cameras.cameras import Cameras
 from random_bricks import scene_of
 
-from mmpi_ns.capture.rays import CameraRays
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.export import details as stored
 from mmpi_ns.export.details import restored_view, stored_view
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
@@ -20,8 +21,7 @@ CPU = torch.device("cpu")
 
 
 def bundle_of(pose):
-    matrices = (torch.tensor(x, dtype=torch.float32)[None] for x in (pose.to_world, pose.focal, pose.center))
-    return CameraRays(*matrices).image(pose.size[1], pose.size[0])
+    return image_rays(Cameras(torch.tensor(pose.to_world)[None], *pose.focal, *pose.center, *pose.size))
 
 
 def test_what_is_kept_of_a_view_is_close_to_it(tmp_path):

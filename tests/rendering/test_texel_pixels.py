@@ -5,9 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 
-from mmpi_ns.capture.rays import CameraRays
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.rendering.rendered import winners
 from mmpi_ns.scene.geometry import Frames
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
@@ -45,7 +46,7 @@ def test_a_texel_spans_its_tangent_seen_from_its_mpi_and_more_from_nearer():
 
 def test_a_texel_of_a_plane_that_faces_the_camera_spans_as_many_pixels_at_the_border_of_the_image():
     pose = torch.tensor([[[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]])
-    rays = CameraRays(pose, torch.tensor([[100.0, 100.0]]), torch.tensor([[50.0, 30.0]])).image(60, 100).flatten()
+    rays = image_rays(Cameras(pose, 100.0, 100.0, 50.0, 30.0, 100, 60)).flatten()
     count = len(rays.origins)
     shown = told([2] * count, rays, torch.linspace(1, 9, count).tolist(), [1.0] * count)
     torch.testing.assert_close(shown["texel_pixels"], torch.full((count, 1), 10.0), rtol=1e-4, atol=0)
