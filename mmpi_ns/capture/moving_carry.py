@@ -14,11 +14,12 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from mmpi_ns.capture.dense import mean_and_contrast
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
 from mmpi_ns.capture.moving_sweep import ALIKE, CONTRAST, INSIDE, compared, solid
-from mmpi_ns.ops.likeness import most_alike
+from mmpi_ns.ops.likeness import Likeness, most_alike
 
 AFTER, STATIC = 2, 4
 """Nearest neighbours from which what moves is followed, and whose static content is compared."""
@@ -48,18 +49,17 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask]) -> M
     view, nearest = shot.view.reduced(2), float(np.percentile(measured, 98))
     ground = np.asarray(cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
     depths = nearest * torch.linspace(BEHIND, BEYOND, DEPTHS)
-    least, most = np.maximum(GROUND * ground - MARGIN * nearest, 0), REACH * nearest
-    stands = moves = inverse = np.full(view.gray.shape, -1, np.float32)
-    for some in (np.s_[:AFTER], np.s_[AFTER:STATIC]):
-        if not others[some]:
-            break
-        views, follows = [other.shot.view.reduced(2) for other in others[some]], some.start is None
-        asked = depths if follows else depths[(depths >= 0) & (depths <= most)]
-        arguments = compared(view, views, masks[some]), asked, torch.from_numpy(least), most, False
-        alike, at = (part.numpy() for part in most_alike(torch.from_numpy(view.gray), *arguments))
-        stands = np.maximum(stands, alike[0])
-        if follows:
-            moves, inverse = alike[2], at[2]
+    least, most = torch.from_numpy(np.maximum(GROUND * ground - MARGIN * nearest, 0)), REACH * nearest
+
+    def best(some: slice, depths: Tensor) -> Likeness:
+        views = [other.shot.view.reduced(2) for other in others[some]]
+        return most_alike(torch.from_numpy(view.gray), compared(view, views, masks[some]), depths, least, most, False)
+
+    alike, at = best(slice(AFTER), depths)
+    stands, moves, inverse = alike[0].numpy(), alike[2].numpy(), at[2].numpy()
+    if len(others) > AFTER:
+        alike, _ = best(slice(AFTER, STATIC), depths[(depths >= 0) & (depths <= most)])
+        stands = np.maximum(stands, alike[0].numpy())
     coherent = np.abs(inverse - cv2.medianBlur(inverse, 5)) <= COHERENT * float(depths[1] - depths[0])
     textured = view.inside & (mean_and_contrast(view.gray)[1] > CONTRAST)
     whole = solid((moves > ALIKE) & (moves > stands + BETTER) & textured & coherent, ground).astype(np.uint8)

@@ -18,7 +18,8 @@ import torch
 from mmpi_ns.capture.dense import mean_and_contrast
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
 from mmpi_ns.capture.views import Map, Parallax, View
-from mmpi_ns.ops.likeness import Others, most_alike
+from mmpi_ns.ops.likeness import most_alike
+from mmpi_ns.ops.patches import Others, others_of
 
 NEIGHBOURS = 4
 """Nearest neighbours that are compared; the mean of the two best correlations counts at each depth."""
@@ -94,17 +95,14 @@ def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: flo
 
 
 def compared(view: View, others: Sequence[View], masks: Sequence[Mask] | None = None) -> Others:
-    """Other views, with what moves in them [H, W], as a view is compared with them."""
-    masks = [np.zeros((1, 1), bool)] * len(others) if masks is None else masks
-    parallaxes = [Parallax.between(view, other).tensors for other in others]
-    gray = [np.where(other.inside, np.maximum(other.gray, 1), 0).astype(np.uint8) for other in others]  # 0: nothing
-    moving = [
-        np.asarray(cv2.resize(mask.astype(np.uint8), image.shape[::-1], interpolation=cv2.INTER_NEAREST))
-        for mask, image in zip(masks, gray, strict=True)
-    ]
-    flat = (torch.from_numpy(np.concatenate([image.ravel() for image in images])) for images in (gray, moving))
-    sizes = torch.tensor([image.shape for image in gray])
-    return Others(*flat, sizes, *(torch.stack(part) for part in zip(*parallaxes, strict=True)))
+    """Other views, and as marks what moves in them, as a view is compared with them (``most_alike``)."""
+    images = []
+    for other, mask in zip(others, masks or [np.zeros((1, 1), bool)] * len(others), strict=True):
+        moving = cv2.resize(mask.astype(np.uint8), other.gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        both = np.where(other.inside, np.maximum(other.gray, 1), 0), moving  # 0: nothing
+        images.append([torch.from_numpy(np.pad(np.asarray(image, np.uint8), 1)) for image in both])
+    linear, b = zip(*(Parallax.between(view, other).tensors for other in others), strict=True)
+    return others_of(images, torch.stack(linear), torch.stack(b))
 
 
 def solid(moves: Mask, ground: Map) -> Mask:

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.likeness import Others, most_alike
+from mmpi_ns.ops.likeness import most_alike
+from mmpi_ns.ops.patches import others_of
 
 SHAPE, SHAPES = (13, 21), [(13, 21), (9, 30), (16, 8), (13, 21)]
 CLOSE = 0.01
@@ -46,12 +47,8 @@ def a_scene(count, seed, ahead=0.5):
 
 
 def operands(grays, marks, linear, b):
-    flat = (
-        torch.from_numpy(np.concatenate([x.ravel() for x in (np.zeros(0, np.uint8), *images)]))
-        for images in (grays, marks)
-    )
-    sizes = torch.tensor([image.shape for image in grays], dtype=torch.int64).view(-1, 2)
-    return Others(*flat, sizes, torch.from_numpy(linear), torch.from_numpy(b))
+    images = [[torch.from_numpy(np.pad(x, 1)) for x in both] for both in zip(grays, marks, strict=True)]
+    return others_of(images, torch.from_numpy(linear), torch.from_numpy(b))
 
 
 class Oracle:
@@ -162,12 +159,9 @@ def test_images_of_one_pixel(value):
     assert inverse.ravel().tolist() == ([0, 0, 0.5] if value else [0, 0, 0])
 
 
-@pytest.mark.parametrize("pairs", [False, True])
-def test_without_depths_or_other_images_nothing_is_alike(pairs):
-    least = np.zeros(SHAPE, np.float32)
-    for scene, depths in ((a_scene(2, 0), np.zeros(0, np.float32)), (a_scene(0, 0), np.float32([0.1, 0.2]))):
-        alike, inverse = asked(scene, depths, least, 1.0, pairs)
-        assert (alike == -1).all() and (inverse == 0).all() and alike.shape == (3, *SHAPE)
+def test_without_depths_nothing_is_alike():
+    alike, inverse = asked(a_scene(2, 0), np.zeros(0, np.float32), np.zeros(SHAPE, np.float32), 1.0, False)
+    assert (alike == -1).all() and (inverse == 0).all() and alike.shape == (3, *SHAPE)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38, -1e38])

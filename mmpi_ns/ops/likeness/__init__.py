@@ -1,8 +1,7 @@
 """How alike an image and others are at inverse depths that are the same all over it, by correlation of windows.
 
-A pixel at inverse depth q appears in another image at the homogeneous pixel a + q b (``ops/matches``). Places there are
-rounded to a 32nd of a pixel and gray levels to integers, as OpenCV does, so that sums over windows are exact in any
-order and can slide from pixel to pixel.
+Places in the others are rounded to a 32nd of a pixel and gray levels to integers, as OpenCV does, so that sums over
+windows are exact in any order and can slide from pixel to pixel.
 """
 
 from __future__ import annotations
@@ -10,30 +9,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.patches import Others
 
 REACH, PIXELS = 3, 49
-"""Pixels of a window on each side of its middle, and all of them. A window with a smaller standard deviation of its
-gray levels than 1 counts as one of 1."""
+"""Pixels of a window on each side of its middle, and all of them. One whose gray levels have a smaller standard
+deviation than 1 counts as one of 1."""
 STEPS = 32
 """Places in a pixel that are told apart."""
-
-
-class Others(NamedTuple):
-    """K images that an image is compared with."""
-
-    gray: UInt8[Tensor, "P"]
-    """Gray levels of all of them, row by row, one after the other; 0: nothing, as is beyond the border."""
-    marked: UInt8[Tensor, "P"]
-    """1 for marked pixels, else 0."""
-    sizes: Int64[Tensor, "K 2"]
-    """Height and width of each."""
-    linear: Float[Tensor, "K 3 3"]
-    """a at a pixel (x, y) of the image is this times (x, y, 1)."""
-    b: Float[Tensor, "K 3"]
 
 
 class Likeness(NamedTuple):
@@ -59,28 +45,19 @@ def most_alike(
 
     Args:
         gray: the image.
-        others: the others.
+        others: the others, each at its size and as marks, in a border of 0 that is a pixel wide; 0 is nothing.
         inverse: inverse depths, behind the camera below 0.
         least: the smallest possible one of each pixel.
         most: the largest possible one of all.
         pairs: the mean of the best two others counts, whatever is marked, instead of each alone.
     """
-    shape, windows = (3, *gray.shape), _Windows(gray)
-    alike, at = torch.full(shape, -1.0), torch.zeros(shape)
-    images = [
-        part.view(2, *size)
-        for part, size in zip(
-            torch.stack([others.gray, others.marked]).split(others.sizes.prod(1).tolist(), 1),
-            others.sizes.tolist(),
-            strict=True,
-        )
-    ]
+    shape, none = (3, *gray.shape), torch.full(gray.shape, -1.0)
+    alike, at, image = torch.full(shape, -1.0), torch.zeros(shape), gray.int()
+    contrast = _sums(image), _over_contrast(image)
     for q in inverse:
-        seen = [windows.compare(*each, q) for each in zip(images, others.linear, others.b, strict=True)]
+        seen = [_compare(image, *contrast, others, k, q) for k in range(len(others.b))]
         if pairs:
-            none = torch.full(gray.shape, -1.0)
-            best = torch.stack([none, none, *(one for one, _ in seen)]).topk(2, 0).values.mean(0)
-            seen = [(best, torch.zeros(gray.shape, dtype=torch.bool))]
+            seen = [(torch.stack([none, *(one for one, _ in seen)]).topk(2, 0).values.mean(0), none > 0)]
         for one, is_marked in seen:
             kind = torch.where(is_marked, 2, torch.where((q >= least) & (q <= most), 0, 1))
             better = (one > alike) & (kind == torch.arange(3)[:, None, None])
@@ -88,37 +65,34 @@ def most_alike(
     return Likeness(alike, at)
 
 
-class _Windows:
-    """Windows about the pixels of an image."""
-
-    def __init__(self, gray: Tensor) -> None:
-        self.gray = gray.long()
-        self.sums, self.squares = _sums(self.gray), _sums(self.gray.square())
-
-    def compare(self, image: Tensor, linear: Tensor, b: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Correlations with another image, and where it is marked. [H, W] each"""
-        (height, width), padded = image.shape[1:], torch.nn.functional.pad(image.long(), (1, 2, 1, 2))
-        y, x = (torch.arange(n) + 0.5 for n in self.gray.shape)
-        at = linear[:, :1, None] * x + ((linear[:, 1:2] * y + linear[:, 2:]) + q * b[:, None])[..., None]
-        ahead = at[2] > 0
-        over = 1 / torch.where(ahead, at[2], 1.0)
-        column, row = ((c * over - 0.5).nan_to_num(-1).clamp(-1, n) for c, n in ((at[0], width), (at[1], height)))
-        to_right, to_down = ((STEPS * c).round().long() for c in (column, row))
-        left, top, u, v = to_right // STEPS + 1, to_down // STEPS + 1, to_right % STEPS, to_down % STEPS
-        upper, lower = ((STEPS - u) * padded[0, rows, left] + u * padded[0, rows, left + 1] for rows in (top, top + 1))
-        seen = torch.where(ahead, ((STEPS - v) * upper + v * lower + STEPS**2 // 2) // STEPS**2, 0)
-        sums, squares = _sums(seen), _sums(seen.square())
-        product = PIXELS * _sums(self.gray * seen) - self.sums * sums
-        mine, theirs = (
-            (PIXELS * second - first * first).clamp(min=PIXELS**2).float().rsqrt()
-            for first, second in ((self.sums, self.squares), (sums, squares))
-        )
-        is_marked = ahead & (padded[1, (row + 1.5).long(), (column + 1.5).long()] > 0)
-        return torch.where(seen > 0, product * mine * theirs, -1.0), is_marked
+def _compare(image: Tensor, sums: Tensor, over: Tensor, others: Others, k: int, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Correlations with another image, and where it is marked. [H, W] each"""
+    (first, height, width), (first_mark, *_) = others.levels[k].tolist()
+    y, x = (torch.arange(n) + 0.5 for n in image.shape)
+    a = others.linear[k]
+    place = a[:, :1, None] * x + ((a[:, 1:2] * y + a[:, 2:]) + q * others.b[k][:, None])[..., None]
+    ahead = place[2] > 0
+    over_depth = 1 / torch.where(ahead, place[2], 1.0)
+    column, row = (
+        (c * over_depth + 0.5).nan_to_num(0).clamp(0, n - 1) for c, n in ((place[0], width), (place[1], height))
+    )
+    right, down = ((STEPS * c).round().int() for c in (column, row))
+    table, u, v = others.corners.view(torch.uint8).view(-1, 4), right % STEPS, down % STEPS
+    four = table[first + down // STEPS * width + right // STEPS].int().unbind(-1)
+    upper, lower = ((STEPS - u) * four[n] + u * four[n + 1] for n in (0, 2))
+    seen = torch.where(ahead, ((STEPS - v) * upper + v * lower + STEPS**2 // 2) // STEPS**2, 0)
+    product = PIXELS * _sums(image * seen) - sums * _sums(seen)
+    is_marked = ahead & (table[first_mark + (row + 0.5).int() * width + (column + 0.5).int(), 0] > 0)
+    return torch.where(seen > 0, product * over * _over_contrast(seen), -1.0), is_marked
 
 
-def _sums(values: Tensor) -> Tensor:
-    """Over the window about each pixel; beyond the border are those of the border."""
-    rows, columns = (torch.arange(-REACH, n + REACH).clamp(0, n - 1) for n in values.shape)
-    side = 2 * REACH + 1
-    return values[rows].unfold(0, side, 1).sum(-1)[:, columns].unfold(1, side, 1).sum(-1)
+def _over_contrast(image: Tensor) -> Tensor:
+    """1 over the standard deviation and the number of pixels of the window about each pixel."""
+    return (PIXELS * _sums(image.square()) - _sums(image).square()).clamp(min=PIXELS**2).float().rsqrt()
+
+
+def _sums(image: Tensor) -> Tensor:
+    """Over the window about each pixel; beyond the border are the pixels of the border."""
+    rows, columns = (torch.arange(-REACH, n + REACH).clamp(0, n - 1) for n in image.shape)
+    rows, columns = (at.unfold(0, 2 * REACH + 1, 1) for at in (rows, columns))
+    return image[rows].sum(1, dtype=torch.int32)[:, columns].sum(2, dtype=torch.int32)

@@ -8,41 +8,32 @@
 
 namespace {
 
-constexpr int REACH = 3, SIDE = 2 * REACH + 1, PIXELS = SIDE * SIDE, STEPS = 32; // as in __init__.py
+constexpr int REACH = 3, SIDE = 2 * REACH + 1, PIXELS = SIDE * SIDE, BITS = 5, STEPS = 1 << BITS; // as in __init__.py
 
-typedef std::vector<uint8_t> Bytes;
+// An image, or what another one shows of its pixels, in rows of whole lanes; and sums over windows about the pixels of
+// a row: of the gray levels, of their squares, and of their products with the image's.
+struct Shown {
+    const int64_t height, width, stride = (width + WIDTH - 1) / WIDTH * WIDTH, length = stride + WIDTH;
+    std::vector<int32_t> gray = std::vector<int32_t>(height * stride), marks = gray;
+    std::vector<int32_t> columns = std::vector<int32_t>(3 * length);
 
-// Sums over the windows about the pixels of a row: of an image, of its squares, and of its products with another one.
-class Windows {
-    const Bytes &image, &by;
-    const int64_t height, width, stride, length;
-    std::vector<int32_t> columns;
-
-    void add(int64_t row, int32_t sign) {
+    void add(const Shown& image, int64_t row, int32_t sign) {
         const int64_t from = std::clamp<int64_t>(row, 0, height - 1) * stride;
-        const uint8_t *x = image.data() + from, *y = by.data() + from;
+        const int32_t *x = gray.data() + from, *y = image.gray.data() + from;
         int32_t *sum = columns.data() + REACH, *squares = sum + length, *products = squares + length;
-        for (int64_t i = 0; i < stride; i++) {
-            const int32_t value = sign * x[i];
-            sum[i] += value;
-            squares[i] += value * x[i];
-            products[i] += value * y[i];
+        for (int64_t i = 0; i < width; i++) {
+            sum[i] += sign * x[i];
+            squares[i] += sign * x[i] * x[i];
+            products[i] += sign * x[i] * y[i];
         }
     }
 
-  public:
-    Windows(const Bytes& image, const Bytes& by, int64_t height, int64_t width, int64_t stride)
-        : image(image), by(by), height(height), width(width), stride(stride), length(stride + WIDTH),
-          columns(3 * length) {}
-
-    // From the row before, or from the first.
-    void slide(int64_t row) {
-        if (row == 0) {
-            std::fill(columns.begin(), columns.end(), 0);
-            for (int64_t i = -REACH; i < REACH; i++) add(i, 1);
-        } else
-            add(row - REACH - 1, -1);
-        add(row + REACH, 1);
+    // To a row from the one before, or to the first.
+    void slide(const Shown& image, int64_t row) {
+        if (row == 0) std::fill(columns.begin(), columns.end(), 0);
+        for (int64_t i = -REACH; row == 0 && i < REACH; i++) add(image, i, 1);
+        if (row > 0) add(image, row - REACH - 1, -1);
+        add(image, row + REACH, 1);
         for (int n = 0; n < 3; n++) {
             int32_t *first = columns.data() + n * length + REACH, *last = first + width - 1;
             std::fill(first - REACH, first, *first);
@@ -51,156 +42,85 @@ class Windows {
     }
 
     IntLanes sum(int n, int64_t column) const {
-        const int32_t* from = columns.data() + n * length + column;
         IntLanes all{};
-        for (int i = 0; i < SIDE; i++) all += load_some<IntLanes>(from + i, WIDTH);
+        for (int i = 0; i < SIDE; i++) all += load_some<IntLanes>(columns.data() + n * length + column + i, WIDTH);
         return all;
     }
-};
 
-// 1 over the windows' standard deviations and number of pixels.
-Lanes over_contrast(IntLanes sums, IntLanes squares) {
-    return inverse_root(real(most(PIXELS * squares - sums * sums, whole(PIXELS * PIXELS))));
-}
+    // 1 over the standard deviations and the number of pixels.
+    Lanes over_contrast(int64_t column) const {
+        const IntLanes sums = sum(0, column), variance = PIXELS * sum(1, column) - sums * sums;
+        return inverse_root(real(most(variance, whole(PIXELS * PIXELS))));
+    }
 
-// Another image, with nothing around it, and what it shows of an image's pixels at an inverse depth.
-struct Other {
-    const int64_t height, width, stride, rows, columns; // of the image
-    const float *linear, *b;
-    std::vector<int32_t> corners, marks; // four bytes: a pixel, the one to its right, and the two below
-    bool is_marked = false;
-    Bytes seen, marked;
-    Windows windows;
-
-    Other(const uint8_t* gray, const uint8_t* marks_of, const int64_t* size, const float* linear, const float* b,
-          const Bytes& image, int64_t rows, int64_t columns, int64_t stride)
-        : height(size[0]), width(size[1]), stride(stride), rows(rows), columns(columns), linear(linear), b(b),
-          corners((height + 2) * (width + 2)), marks(corners.size()), seen(rows * stride), marked(rows * stride),
-          windows(seen, image, rows, columns, stride) {
-        const int64_t line = width + 2;
-        for (int64_t i = 0; i < height * width; i++) {
-            const int64_t at = (i / width + 1) * line + i % width + 1;
-            const uint32_t value = gray[i];
-            corners[at] |= value;
-            corners[at - 1] |= value << 8;
-            corners[at - line] |= value << 16;
-            corners[at - line - 1] |= value << 24;
-            marks[at] = marks_of[i];
-            is_marked |= marks_of[i] > 0;
+    // Looks at an inverse depth. Levels: first pixel, height and width of another image, and of its marks.
+    void look(const int32_t* corners, const int64_t* levels, const float* linear, const float* b, float q,
+              bool at_marks) {
+        const int32_t line = levels[2];
+        for (int64_t place = 0; place < height * stride; place += WIDTH) {
+            const float row = place / stride + 0.5f, column = place % stride + 0.5f;
+            Lanes at[3];
+            for (int i = 0; i < 3; i++)
+                at[i] = linear[3 * i] * (IOTA + column) + ((linear[3 * i + 1] * row + linear[3 * i + 2]) + q * b[i]);
+            const Mask ahead = at[2] > 0;
+            const Lanes over = 1.0f / pick(ahead, at[2], splat(1));
+            // What is no number becomes 0, which is on the border.
+            const Lanes x = least(most(at[0] * over + 0.5f, Lanes{}), splat(line - 1));
+            const Lanes y = least(most(at[1] * over + 0.5f, Lanes{}), splat(levels[1] - 1));
+            const Lanes magic = splat(12582912.0f); // 1.5 * 2^23: adding it rounds to an integer
+            const IntLanes right = truncated((x * float(STEPS) + magic) - magic), u = right & (STEPS - 1);
+            const IntLanes down = truncated((y * float(STEPS) + magic) - magic), v = down & (STEPS - 1);
+            const IntLanes four = gather(corners + levels[0], (down >> BITS) * line + (right >> BITS));
+            const auto between = [](IntLanes a, IntLanes b, IntLanes share) { return a * STEPS + share * (b - a); };
+            const IntLanes upper = between(four & 255, four >> 8 & 255, u);
+            const IntLanes lower = between(four >> 16 & 255, four >> 24 & 255, u);
+            store(gray.data() + place, ((between(upper, lower, v) + STEPS * STEPS / 2) >> 2 * BITS) & ahead);
+            if (!at_marks) continue;
+            const IntLanes nearest = truncated(y + 0.5f) * line + truncated(x + 0.5f);
+            store(marks.data() + place, gather(corners + levels[3], nearest) & 255 & ahead);
         }
-    }
-
-    // Whether it shows anything.
-    bool look(float q) {
-        IntLanes all{};
-        for (int64_t row = 0; row < rows; row++)
-            for (int64_t column = 0; column < columns; column += WIDTH) {
-                Lanes at[3];
-                for (int i = 0; i < 3; i++) {
-                    const float* m = linear + 3 * i;
-                    at[i] = m[0] * (IOTA + (column + 0.5f)) + ((m[1] * (row + 0.5f) + m[2]) + q * b[i]);
-                }
-                const Mask ahead = at[2] > 0;
-                const Lanes over = 1.0f / pick(ahead, at[2], splat(1));
-                // What is no number becomes -1.
-                const Lanes x = least(most(at[0] * over - 0.5f, splat(-1)), splat(width));
-                const Lanes y = least(most(at[1] * over - 0.5f, splat(-1)), splat(height));
-                const Lanes magic = splat(12582912.0f); // 1.5 * 2^23: adding it rounds to an integer
-                const IntLanes to_right = truncated((x * float(STEPS) + magic) - magic);
-                const IntLanes to_down = truncated((y * float(STEPS) + magic) - magic);
-                const IntLanes u = to_right & (STEPS - 1), v = to_down & (STEPS - 1);
-                const int32_t line = width + 2;
-                const IntLanes four = gather(corners.data(), ((to_down >> 5) + 1) * line + (to_right >> 5) + 1);
-                const auto between = [](IntLanes a, IntLanes b, IntLanes share) { return a * STEPS + share * (b - a); };
-                const IntLanes upper = between(four & 255, four >> 8 & 255, u);
-                const IntLanes lower = between(four >> 16 & 255, four >> 24 & 255, u);
-                const IntLanes value = ((between(upper, lower, v) + STEPS * STEPS / 2) >> 10) & ahead;
-                all |= value;
-                write(seen, row, column, value);
-                if (!is_marked) continue;
-                const IntLanes nearest = truncated(y + 1.5f) * line + truncated(x + 1.5f);
-                write(marked, row, column, gather(marks.data(), nearest) & ahead);
-            }
-        return any(all);
-    }
-
-    void write(Bytes& to, int64_t row, int64_t column, IntLanes values) const {
-        const ByteLanes bytes = __builtin_convertvector(values, ByteLanes);
-        __builtin_memcpy(to.data() + row * stride + column, &bytes, sizeof bytes);
-    }
-
-    static IntLanes read(const Bytes& from, int64_t place) {
-        ByteLanes bytes;
-        __builtin_memcpy(&bytes, from.data() + place, sizeof bytes);
-        return __builtin_convertvector(bytes, IntLanes);
-    }
-
-    // Correlations with windows of which sums and `over_contrast` are given, in the row to which sums have slid.
-    Lanes alike(IntLanes sums, Lanes over, int64_t row, int64_t column) const {
-        const IntLanes theirs = windows.sum(0, column), product = PIXELS * windows.sum(2, column) - sums * theirs;
-        const Lanes correlation = real(product) * over * over_contrast(theirs, windows.sum(1, column));
-        return pick(read(seen, row * stride + column) > 0, correlation, splat(-1));
     }
 };
 
-void mmpi_most_alike(int64_t, int64_t, const uint8_t* gray, const uint8_t* others, const uint8_t* marked,
-                     const int64_t* sizes, const float* linear, const float* b, const float* inverse,
-                     const float* smallest, float largest, bool pairs, int64_t height, int64_t width, int64_t,
-                     int64_t count, int64_t depths, float* alike, float* at) {
-    const int64_t stride = (width + WIDTH - 1) / WIDTH * WIDTH, pixels = height * width;
-    Bytes image(height * stride);
-    for (int64_t row = 0; row < height; row++) std::copy_n(gray + row * width, width, image.data() + row * stride);
-    std::vector<int32_t> sums(image.size());
-    std::vector<float> contrasts(image.size());
-    Windows windows(image, image, height, width, stride);
-    for (int64_t row = 0; row < height; row++) {
-        windows.slide(row);
-        for (int64_t column = 0; column < width; column += WIDTH) {
-            const IntLanes sum = windows.sum(0, column);
-            store(sums.data() + row * stride + column, sum);
-            store(contrasts.data() + row * stride + column, over_contrast(sum, windows.sum(1, column)));
-        }
-    }
-    std::vector<Other> all;
-    all.reserve(count); // windows refer to what they are of
-    for (int64_t k = 0, first = 0; k < count; first += sizes[2 * k] * sizes[2 * k + 1], k++)
-        all.emplace_back(others + first, marked + first, sizes + 2 * k, linear + 9 * k, b + 3 * k, image, height, width,
-                         stride);
-    std::fill(alike, alike + 3 * pixels, -1.0f);
-    std::fill(at, at + 3 * pixels, 0.0f);
-    std::vector<Other*> shown;
-    for (int64_t d = 0; d < depths; d++) {
-        const float q = inverse[d];
-        shown.clear();
-        for (Other& other : all)
-            if (other.look(q)) shown.push_back(&other);
+void mmpi_most_alike(int64_t, int64_t, const uint8_t* gray, const int32_t* corners, const int64_t* levels,
+                     const float* linear, const float* b, const float* inverse, const float* smallest, float largest,
+                     bool pairs, int64_t height, int64_t width, int64_t, int64_t count, int64_t, int64_t depths,
+                     float* alike, float* at) {
+    Shown image{height, width};
+    for (int64_t i = 0; i < height * width; i++) image.gray[i / width * image.stride + i % width] = gray[i];
+    std::vector<Shown> others(count, image);
+    std::fill(alike, alike + 3 * height * width, -1.0f);
+    std::fill(at, at + 3 * height * width, 0.0f);
+    for (const float* q = inverse; q < inverse + depths; q++) {
+        for (int64_t k = 0; k < count; k++)
+            others[k].look(corners, levels + 6 * k, linear + 9 * k, b + 3 * k, *q, !pairs);
         for (int64_t row = 0; row < height; row++) {
-            for (Other* other : shown) other->windows.slide(row);
+            image.slide(image, row);
+            for (Shown& other : others) other.slide(image, row);
             for (int64_t column = 0; column < width; column += WIDTH) {
-                const int64_t here = row * stride + column, pixel = row * width + column, some = width - column;
-                const IntLanes sum = load_some<IntLanes>(sums.data() + here, WIDTH);
-                const Lanes over = load(contrasts.data() + here), bound = load_some<Lanes>(smallest + pixel, some);
-                const Mask possible = (q >= bound) & (q <= largest ? -1 : 0);
-                Lanes first = splat(-1), second = first, now[3] = {first, first, first};
-                for (const Other* other : shown) {
-                    const Lanes one = other->alike(sum, over, row, column);
+                const int64_t here = row * image.stride + column, pixel = row * width + column, some = width - column;
+                const IntLanes sum = image.sum(0, column);
+                const Lanes over = image.over_contrast(column);
+                const Mask possible = (*q >= load_some<Lanes>(smallest + pixel, some)) & whole(-(*q <= largest));
+                Lanes first = splat(-1), second = first, best[3] = {first, first, first};
+                const auto take = [&](Lanes one, Mask marked) {
+                    const Mask kinds[3] = {possible & ~marked, ~possible & ~marked, marked};
+                    for (int n = 0; n < 3; n++) best[n] = pick(kinds[n], most(one, best[n]), best[n]);
+                };
+                for (const Shown& other : others) {
+                    const IntLanes products = PIXELS * other.sum(2, column) - sum * other.sum(0, column);
+                    const Mask is_shown = load_some<IntLanes>(other.gray.data() + here, WIDTH) > 0;
+                    const Lanes one = pick(is_shown, real(products) * over * other.over_contrast(column), splat(-1));
                     second = most(second, least(first, one));
                     first = most(first, one);
-                    if (pairs) continue;
-                    const Mask is_marked = Other::read(other->marked, here) > 0, kinds[3] = {
-                        possible & ~is_marked, ~possible & ~is_marked, is_marked};
-                    for (int n = 0; n < 3; n++) now[n] = pick(kinds[n] & (one > now[n]), one, now[n]);
+                    if (!pairs) take(one, load_some<IntLanes>(other.marks.data() + here, WIDTH) > 0);
                 }
-                if (pairs) {
-                    now[0] = pick(possible, (first + second) * 0.5f, now[0]);
-                    now[1] = pick(possible, now[1], (first + second) * 0.5f);
-                }
+                if (pairs) take((first + second) * 0.5f, Mask{});
                 for (int n = 0; n < 3; n++) {
-                    float *best = alike + n * pixels + pixel, *its = at + n * pixels + pixel;
-                    const Lanes before = load_some<Lanes>(best, some);
-                    const Mask better = now[n] > before;
-                    store_some(best, pick(better, now[n], before), some);
-                    store_some(its, pick(better, splat(q), load_some<Lanes>(its, some)), some);
+                    float *alike_now = alike + n * height * width + pixel, *at_now = at + n * height * width + pixel;
+                    const Mask better = best[n] > load_some<Lanes>(alike_now, some);
+                    store_some(alike_now, pick(better, best[n], load_some<Lanes>(alike_now, some)), some);
+                    store_some(at_now, pick(better, splat(*q), load_some<Lanes>(at_now, some)), some);
                 }
             }
         }
