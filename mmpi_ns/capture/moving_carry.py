@@ -14,7 +14,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
 
 from mmpi_ns.capture.dense import mean_and_contrast
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
@@ -51,7 +50,7 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask]) -> M
     depths = nearest * torch.linspace(BEHIND, BEYOND, DEPTHS)
     least, most = torch.from_numpy(np.maximum(GROUND * ground - MARGIN * nearest, 0)), REACH * nearest
 
-    def best(some: slice, depths: Tensor) -> Likeness:
+    def best(some: slice, depths: torch.Tensor) -> Likeness:
         views = [other.shot.view.reduced(2) for other in others[some]]
         return most_alike(torch.from_numpy(view.gray), compared(view, views, masks[some]), depths, least, most, False)
 

@@ -15,11 +15,9 @@ from torch import Tensor
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.patches import Others
 
-REACH, PIXELS = 3, 49
-"""Pixels of a window on each side of its middle, and all of them. One whose gray levels have a smaller standard
-deviation than 1 counts as one of 1."""
-STEPS = 32
-"""Places in a pixel that are told apart."""
+REACH, PIXELS, STEPS = 3, 49, 32
+"""Pixels of a window on each side of its middle, all of them, and places in a pixel that are told apart. A window whose
+gray levels have a smaller standard deviation than 1 counts as one of 1."""
 
 
 class Likeness(NamedTuple):
@@ -68,14 +66,11 @@ def most_alike(
 def _compare(image: Tensor, sums: Tensor, over: Tensor, others: Others, k: int, q: Tensor) -> tuple[Tensor, Tensor]:
     """Correlations with another image, and where it is marked. [H, W] each"""
     (first, height, width), (first_mark, *_) = others.levels[k].tolist()
-    y, x = (torch.arange(n) + 0.5 for n in image.shape)
-    a = others.linear[k]
+    a, (y, x) = others.linear[k], (torch.arange(n) + 0.5 for n in image.shape)
     place = a[:, :1, None] * x + ((a[:, 1:2] * y + a[:, 2:]) + q * others.b[k][:, None])[..., None]
     ahead = place[2] > 0
-    over_depth = 1 / torch.where(ahead, place[2], 1.0)
-    column, row = (
-        (c * over_depth + 0.5).nan_to_num(0).clamp(0, n - 1) for c, n in ((place[0], width), (place[1], height))
-    )
+    places = (c / torch.where(ahead, place[2], 1.0) + 0.5 for c in place[:2])
+    column, row = (c.nan_to_num(0).clamp(0, n - 1) for c, n in zip(places, (width, height), strict=True))
     right, down = ((STEPS * c).round().int() for c in (column, row))
     table, u, v = others.corners.view(torch.uint8).view(-1, 4), right % STEPS, down % STEPS
     four = table[first + down // STEPS * width + right // STEPS].int().unbind(-1)

@@ -64,10 +64,10 @@ struct Shown {
                 at[i] = linear[3 * i] * (IOTA + column) + ((linear[3 * i + 1] * row + linear[3 * i + 2]) + q * b[i]);
             const Mask ahead = at[2] > 0;
             const Lanes over = 1.0f / pick(ahead, at[2], splat(1));
+            const Lanes magic = splat(12582912.0f); // 1.5 * 2^23: adding it rounds to an integer
             // What is no number becomes 0, which is on the border.
             const Lanes x = least(most(at[0] * over + 0.5f, Lanes{}), splat(line - 1));
             const Lanes y = least(most(at[1] * over + 0.5f, Lanes{}), splat(levels[1] - 1));
-            const Lanes magic = splat(12582912.0f); // 1.5 * 2^23: adding it rounds to an integer
             const IntLanes right = truncated((x * float(STEPS) + magic) - magic), u = right & (STEPS - 1);
             const IntLanes down = truncated((y * float(STEPS) + magic) - magic), v = down & (STEPS - 1);
             const IntLanes four = gather(corners + levels[0], (down >> BITS) * line + (right >> BITS));
