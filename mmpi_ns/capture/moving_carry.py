@@ -57,8 +57,8 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask]) -> M
     alike, at = best(slice(AFTER), depths)
     stands, moves, inverse = alike[0].numpy(), alike[2].numpy(), at[2].numpy()
     if len(others) > AFTER:
-        alike, _ = best(slice(AFTER, STATIC), depths[(depths >= 0) & (depths <= most)])
-        stands = np.maximum(stands, alike[0].numpy())
+        rest = best(slice(AFTER, STATIC), depths[(depths >= 0) & (depths <= most)])
+        stands = np.maximum(stands, rest.alike[0].numpy())
     coherent = np.abs(inverse - cv2.medianBlur(inverse, 5)) <= COHERENT * float(depths[1] - depths[0])
     textured = view.inside & (mean_and_contrast(view.gray)[1] > CONTRAST)
     whole = solid((moves > ALIKE) & (moves > stands + BETTER) & textured & coherent, ground).astype(np.uint8)

@@ -89,5 +89,6 @@ def _over_contrast(image: Tensor) -> Tensor:
 def _sums(image: Tensor) -> Tensor:
     """Over the window about each pixel; beyond the border are the pixels of the border."""
     rows, columns = (torch.arange(-REACH, n + REACH).clamp(0, n - 1) for n in image.shape)
-    rows, columns = (at.unfold(0, 2 * REACH + 1, 1) for at in (rows, columns))
-    return image[rows].sum(1, dtype=torch.int32)[:, columns].sum(2, dtype=torch.int32)
+    totals = torch.nn.functional.pad(image[rows[:, None], columns].cumsum(0).cumsum(1), (1, 0, 1, 0))
+    down = totals[2 * REACH + 1 :] - totals[: -2 * REACH - 1]
+    return down[:, 2 * REACH + 1 :] - down[:, : -2 * REACH - 1]

@@ -89,8 +89,7 @@ void mmpi_most_alike(int64_t, int64_t, const uint8_t* gray, const int32_t* corne
     Shown image{height, width};
     for (int64_t i = 0; i < height * width; i++) image.gray[i / width * image.stride + i % width] = gray[i];
     std::vector<Shown> others(count, image);
-    std::fill(alike, alike + 3 * height * width, -1.0f);
-    std::fill(at, at + 3 * height * width, 0.0f);
+    for (int64_t i = 0; i < 3 * height * width; i++) alike[i] = -1, at[i] = 0;
     for (const float* q = inverse; q < inverse + depths; q++) {
         for (int64_t k = 0; k < count; k++)
             others[k].look(corners, levels + 6 * k, linear + 9 * k, b + 3 * k, *q, !pairs);
