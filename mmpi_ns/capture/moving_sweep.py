@@ -77,7 +77,7 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
         for mask in (solid(below, ground), air)
     )
     inner = cv2.erode(below, np.ones((INSIDE, INSIDE), np.uint8))
-    return Sweep(below > 0, (inner | air) > 0)
+    return Sweep(below > 0, (inner > 0) | (air > 0))
 
 
 def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: float) -> tuple[Map, Mask]:
