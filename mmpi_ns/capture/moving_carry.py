@@ -13,11 +13,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+import torch
 
-from mmpi_ns.capture.dense import correlation, mean_and_contrast
-from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, Warp
-from mmpi_ns.capture.moving_sweep import ALIKE, CONTRAST, INSIDE, solid
-from mmpi_ns.capture.views import Map
+from mmpi_ns.capture.dense import mean_and_contrast
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
+from mmpi_ns.capture.moving_sweep import ALIKE, CONTRAST, INSIDE, compared, solid
+from mmpi_ns.ops.likeness import Likeness, most_alike
 
 AFTER, STATIC = 2, 4
 """Nearest neighbours from which what moves is followed, and whose static content is compared."""
@@ -44,42 +45,22 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask]) -> M
     nothing, measured = np.zeros(shot.view.gray.shape, bool), shot.depth.inverse[shot.depth.inverse > 0]
     if shot.ground is None or not len(measured) or not any(mask.any() for mask in masks[:AFTER]):
         return nothing
-    view = shot.view.reduced(2)
-    size, of_view = view.gray.shape[::-1], mean_and_contrast(view.gray)
-    ground = np.asarray(cv2.resize(shot.ground, size, interpolation=cv2.INTER_NEAREST), np.float32)
-    images = []
-    for other, mask in zip(others[:STATIC], masks, strict=False):
-        seen = other.shot.view.reduced(2)
-        shown = np.where(seen.inside, np.maximum(seen.gray, 1), 0).astype(np.uint8)  # 0: nothing
-        moving = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-        images.append((shown, moving, Warp.between(view, seen)))
-    nearest = float(np.percentile(measured, 98))
-    moves, stands = np.full((2, *view.gray.shape), -1, np.float32)
-    inverse = np.zeros_like(moves)
-    depths = nearest * np.linspace(BEHIND, BEYOND, DEPTHS, dtype=np.float32)
-    for q in depths:
-        possible = (q >= 0) & (q <= REACH * nearest) & (q >= GROUND * ground - MARGIN * nearest)
-        for n, (shown, moving, warp) in enumerate(images):
-            follows = n < AFTER and moving.any()
-            if not follows and not possible.any():
-                continue
-            x, y, ahead = warp.places(np.full_like(moves, q))
-            gray = np.asarray(cv2.remap(shown, x, y, cv2.INTER_LINEAR), np.uint8)
-            alike = correlation(view.gray, gray, of_view)
-            alike[(gray == 0) | (ahead <= 0)] = -1
-            is_moving = cv2.remap(moving, x, y, cv2.INTER_NEAREST) > 0
-            _raise(stands, alike, possible & ~is_moving)
-            if follows:
-                inverse[_raise(moves, alike, is_moving)] = q
-    coherent = np.abs(inverse - cv2.medianBlur(inverse, 5)) <= COHERENT * (depths[1] - depths[0])
-    textured = view.inside & (of_view[1] > CONTRAST)
+    view, nearest = shot.view.reduced(2), float(np.percentile(measured, 98))
+    ground = np.asarray(cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
+    depths = nearest * torch.linspace(BEHIND, BEYOND, DEPTHS)
+    least, most = torch.from_numpy(np.maximum(GROUND * ground - MARGIN * nearest, 0)), REACH * nearest
+
+    def best(some: slice, depths: torch.Tensor) -> Likeness:
+        views = [other.shot.view.reduced(2) for other in others[some]]
+        return most_alike(torch.from_numpy(view.gray), compared(view, views, masks[some]), depths, least, most, False)
+
+    alike, at = best(slice(AFTER), depths)
+    stands, moves, inverse = alike[0].numpy(), alike[2].numpy(), at[2].numpy()
+    if len(others) > AFTER:
+        rest = best(slice(AFTER, STATIC), depths[(depths >= 0) & (depths <= most)])
+        stands = np.maximum(stands, rest.alike[0].numpy())
+    coherent = np.abs(inverse - cv2.medianBlur(inverse, 5)) <= COHERENT * float(depths[1] - depths[0])
+    textured = view.inside & (mean_and_contrast(view.gray)[1] > CONTRAST)
     whole = solid((moves > ALIKE) & (moves > stands + BETTER) & textured & coherent, ground).astype(np.uint8)
     whole = cv2.resize(whole, nothing.shape[::-1], interpolation=cv2.INTER_NEAREST)
     return cv2.erode(whole, np.ones((INSIDE, INSIDE), np.uint8)) > 0  # windows reach beyond what moves
-
-
-def _raise(best: Map, values: Map, where: Mask) -> Mask:
-    """Takes the larger of two values, in place, at some pixels; those where it rose. [h, w] each"""
-    better = where & (values > best)
-    best[better] = values[better]
-    return better

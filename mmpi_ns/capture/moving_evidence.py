@@ -234,7 +234,7 @@ class Neighbour:
         still = self.shot.view.inside if moves is None else self.shot.view.inside & ~moves
         layer = np.asarray(cv2.cvtColor(self.color, cv2.COLOR_BGR2BGRA), np.uint8)
         layer[..., 3] = 0
-        layer[1:-1, 1:-1, 3][still[1:-1, 1:-1]] = ALL
+        layer[1:-1, 1:-1, 3] = all_where(still[1:-1, 1:-1])
         return layer
 
 

@@ -13,10 +13,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 
-from mmpi_ns.capture.dense import correlation, mean_and_contrast
-from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, Warp
-from mmpi_ns.capture.views import Map, View
+from mmpi_ns.capture.dense import mean_and_contrast
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
+from mmpi_ns.capture.views import Map, Parallax, View
+from mmpi_ns.ops.likeness import most_alike
+from mmpi_ns.ops.patches import Others, others_of
 
 NEIGHBOURS = 4
 """Nearest neighbours that are compared; the mean of the two best correlations counts at each depth."""
@@ -74,40 +77,32 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
         for mask in (solid(below, ground), air)
     )
     inner = cv2.erode(below, np.ones((INSIDE, INSIDE), np.uint8))
-    return Sweep(below > 0, (inner | air) > 0)
+    return Sweep(below > 0, (inner > 0) | (air > 0))
 
 
 def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: float) -> tuple[Map, Mask]:
     """The inverse depth at which most is alike, 0 where nothing is, and where only impossible ones are. [h, w] each"""
-    shape, of_view = view.gray.shape, mean_and_contrast(view.gray)
-    warps = [Warp.between(view, other) for other in others]
-    grays = [np.where(other.inside, np.maximum(other.gray, 1), 0).astype(np.uint8) for other in others]  # 0: nothing
-    least, step = BELOW * ground - MARGIN * largest, largest / POSITIVE
-    moves, stands, best = np.full((3, *shape), -1, np.float32)
-    inverse, false = np.zeros((2, *shape), np.float32)
-    for n in range(-NEGATIVE, POSITIVE + 1):
-        q, depths = n * step, np.full(shape, n * step, np.float32)
-        first, second = np.full((2, *shape), -1, np.float32)
-        for gray, warp in zip(grays, warps, strict=True):
-            x, y, ahead = warp.places(depths)
-            if ahead.min() <= 0:  # in part behind the other camera
-                continue
-            seen = np.asarray(cv2.remap(gray, x, y, cv2.INTER_LINEAR), np.uint8)
-            alike = correlation(view.gray, seen, of_view)
-            alike[seen == 0] = -1
-            second = np.maximum(second, np.minimum(first, alike))
-            first = np.maximum(first, alike)
-        confirmed = (first + second) / 2
-        impossible = q < least
-        np.copyto(false, q, where=impossible & (confirmed > moves))
-        np.maximum(moves, confirmed, out=moves, where=impossible)
-        np.maximum(stands, confirmed, out=stands, where=~impossible)
-        np.copyto(inverse, q, where=confirmed > best)
-        np.maximum(best, confirmed, out=best)
-    inverse = np.where((best > MEASURED) & (of_view[1] > MEASURED_CONTRAST), inverse, 0)
+    contrast, step = mean_and_contrast(view.gray)[1], largest / POSITIVE
+    depths = step * torch.arange(-NEGATIVE, POSITIVE + 1)
+    least = torch.from_numpy(BELOW * ground - MARGIN * largest)
+    alike, at = most_alike(torch.from_numpy(view.gray), compared(view, others), depths, least, np.inf, True)
+    (stands, moves, _), (possible, false, _) = alike.numpy(), at.numpy()
+    inverse = np.where(moves >= stands, false, possible)
+    inverse = np.where((np.maximum(moves, stands) > MEASURED) & (contrast > MEASURED_CONTRAST), inverse, 0)
     coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
-    textured = view.inside & (of_view[1] > CONTRAST)
+    textured = view.inside & (contrast > CONTRAST)
     return inverse, (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
+
+
+def compared(view: View, others: Sequence[View], masks: Sequence[Mask] | None = None) -> Others:
+    """Other views, and as marks what moves in them, as a view is compared with them (``most_alike``)."""
+    images = []
+    for other, mask in zip(others, masks or [np.zeros((1, 1), bool)] * len(others), strict=True):
+        moving = cv2.resize(mask.astype(np.uint8), other.gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        both = np.where(other.inside, np.maximum(other.gray, 1), 0), moving  # 0: nothing
+        images.append([torch.from_numpy(np.pad(np.asarray(image, np.uint8), 1)) for image in both])
+    linear, b = zip(*(Parallax.between(view, other).tensors for other in others), strict=True)
+    return others_of(images, torch.stack(linear), torch.stack(b))
 
 
 def solid(moves: Mask, ground: Map) -> Mask:

@@ -24,6 +24,8 @@ FORMING = 0.4
 """Factor of the weight below which bricks are released while surfaces still form."""
 WORTH = 1.25
 """Least multiple of texels for which tables grow beyond the plan."""
+ROOM = 0.6
+"""Share of the planned memory that finer texels may fill: more learn single images (docs/log/texel-size.md)."""
 MOST_COPIED = 0.1
 """Share of the bricks that get a finer copy for their own errors; those beside them get one, too."""
 
@@ -72,9 +74,10 @@ def prepare_storage(
 
 
 def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any, Any]]) -> None:
-    """Makes texels finer than planned where bricks were released: as fine as the plan allows within ``budget`` bytes of
-    tables and moments. ``trained`` are optimisers and their tables."""
-    plan, needed = field.full_plan, stored_bytes(field.num_bricks, len(field.tiles), work)
+    """Makes texels finer than planned where bricks were released: as fine as the plan allows within ``ROOM`` of
+    ``budget`` bytes of tables and moments. ``trained`` are optimisers and their tables."""
+    plan, budget = field.full_plan, int(ROOM * budget)
+    needed = stored_bytes(field.num_bricks, len(field.tiles), work)
     longest = max(n for shape in head_shapes(plan) for n in shape[1:])
     factor = min(plan.detail, (MOST_TEXELS / longest) ** 2, field.factor * budget / needed)
     while factor >= WORTH * field.factor:

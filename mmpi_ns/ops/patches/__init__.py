@@ -19,8 +19,6 @@ from mmpi_ns.ops.matches import linear_at
 
 REACH = 2
 """Pixels of a patch on each side of its middle."""
-LEVELS = 3
-"""Sizes of an image that is compared: twice, once and half as large as it should be."""
 LEAST_AHEAD, LEAST_SHARE = 1e-6, 0.2
 """Depth there over depth here, at least, and of a patch's pixels over that of its middle."""
 LEAST_CONTRAST = 1.0
@@ -39,8 +37,8 @@ class Others(NamedTuple):
     corners: Int32[Tensor, "T"]
     """Pixels of all their sizes, row by row, one after the other: four bytes, of a pixel, the one to its right, the one
     below and the one below that; beyond the border those of the border."""
-    levels: Int64[Tensor, "K 3 3"]
-    """First pixel, height and width of each at twice its size, once and half of it."""
+    levels: Int64[Tensor, "K L 3"]
+    """First pixel, height and width of each at twice its size, once and half of it (or as an operation says)."""
     linear: Float[Tensor, "K 3 3"]
     """a at a pixel (x, y) of the image is this times (x, y, 1)."""
     b: Float[Tensor, "K 3"]
@@ -193,7 +191,7 @@ def _correlations(
 def others_of(
     grays: list[list[UInt8[Tensor, "h w"]]], linear: Float[Tensor, "K 3 3"], b: Float[Tensor, "K 3"]
 ) -> Others:
-    """Images to compare with, each at twice its size, once and half of it."""
+    """Images to compare with, each at twice its size, once and half of it (or as an operation says)."""
     corners, levels, first = [], [], 0
     for gray in (gray for sizes in grays for gray in sizes):
         right = torch.cat([gray[:, 1:], gray[:, -1:]], 1)
@@ -201,4 +199,4 @@ def others_of(
         corners.append(torch.cat([pair, torch.cat([pair[1:], pair[-1:]])], -1).view(torch.int32).flatten())
         levels.append([first, *gray.shape])
         first += gray.numel()
-    return Others(torch.cat(corners), torch.tensor(levels).view(-1, LEVELS, 3), linear, b)
+    return Others(torch.cat(corners), torch.tensor(levels).view(len(grays), -1, 3), linear, b)

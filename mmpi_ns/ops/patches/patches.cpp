@@ -198,7 +198,7 @@ Plane turned(const Plane& plane, const Plane& turn, Lanes x, float y, const floa
 void mmpi_compare_planes(int64_t begin, int64_t end, const uint8_t* gray, const float* planes, const float* alike,
                          const float* others, const int32_t* corners, const int64_t* sizes, const float* linear,
                          const float* b, int64_t stride, int64_t height, int64_t width, int64_t, int64_t count,
-                         float* best, float* best_alike) {
+                         int64_t, float* best, float* best_alike) {
     const Image image{height, width, gray, corners, sizes, linear, b, count, stride};
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
@@ -212,7 +212,7 @@ void mmpi_compare_planes(int64_t begin, int64_t end, const uint8_t* gray, const 
 void mmpi_spread_planes(int64_t begin, int64_t end, const uint8_t* gray, const float* planes, const float* alike,
                         const float* changes, const float* pinhole, const int32_t* corners, const int64_t* sizes,
                         const float* linear, const float* b, int64_t stride, int64_t offset, int64_t height,
-                        int64_t width, int64_t, int64_t count, float* best, float* best_alike) {
+                        int64_t width, int64_t, int64_t count, int64_t, float* best, float* best_alike) {
     const Image image{height, width, gray, corners, sizes, linear, b, count, stride};
     const int64_t shifts[4][2] = {{-offset, 0}, {offset, 0}, {0, -offset}, {0, offset}};
     for (int64_t row = begin; row < end; row++)
