@@ -28,7 +28,7 @@ from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
-from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
+from mmpi_ns.rendering.baked import BakedWindow, bake, why_not_baked
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
@@ -254,9 +254,10 @@ class MMPIModel(Model):
         mode, first_head = self.config.rendering.mode, sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
-        may_bake = mode == "auto" and not self.trains and one_exposure and self.scoring is None
+        is_quick = dispatch.form_of("show_baked", field.features.data) == "cpu" and not torch.is_grad_enabled()
+        may_bake = mode == "auto" and is_quick and not self.trains and one_exposure and self.scoring is None
         bundle = bounded(bundle, field.plan)
-        if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
+        if chosen is None and (mode == "baked" or (may_bake and not why_not_baked(field))):
             rays = rays_of(bundle)
             bounds = rays.nears, rays.fars
             outputs = self.baked(field).render(rays.origins, rays.directions, bounds, background)

@@ -67,9 +67,17 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
         return Sweep(nothing, nothing)
     view, largest = shot.view.reduced(2), REACH * float(np.percentile(measured, 98))
     ground = np.asarray(cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
-    inverse, below = _at_all_depths(
-        view, [other.shot.view.reduced(2) for other in others[:NEIGHBOURS]], ground, largest
-    )
+    contrast, step = mean_and_contrast(view.gray)[1], largest / POSITIVE
+    depths = step * torch.arange(-NEGATIVE, POSITIVE + 1)
+    least = torch.from_numpy(BELOW * ground - MARGIN * largest)
+    near = compared(view, [other.shot.view.reduced(2) for other in others[:NEIGHBOURS]])
+    alike, at = most_alike(torch.from_numpy(view.gray), near, depths, least, np.inf, True)
+    (stands, moves, _), (possible, false, _) = alike.numpy(), at.numpy()
+    inverse = np.where(moves >= stands, false, possible)
+    inverse = np.where((np.maximum(moves, stands) > MEASURED) & (contrast > MEASURED_CONTRAST), inverse, 0)
+    coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
+    textured = view.inside & (contrast > CONTRAST)
+    below = (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
     views = [shot.view, *(other.shot.view for other in others)]
     air = floats(inverse, ground) if is_straight(views) else np.zeros_like(below)
     below, air = (
@@ -78,20 +86,6 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
     )
     inner = cv2.erode(below, np.ones((INSIDE, INSIDE), np.uint8))
     return Sweep(below > 0, (inner > 0) | (air > 0))
-
-
-def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: float) -> tuple[Map, Mask]:
-    """The inverse depth at which most is alike, 0 where nothing is, and where only impossible ones are. [h, w] each"""
-    contrast, step = mean_and_contrast(view.gray)[1], largest / POSITIVE
-    depths = step * torch.arange(-NEGATIVE, POSITIVE + 1)
-    least = torch.from_numpy(BELOW * ground - MARGIN * largest)
-    alike, at = most_alike(torch.from_numpy(view.gray), compared(view, others), depths, least, np.inf, True)
-    (stands, moves, _), (possible, false, _) = alike.numpy(), at.numpy()
-    inverse = np.where(moves >= stands, false, possible)
-    inverse = np.where((np.maximum(moves, stands) > MEASURED) & (contrast > MEASURED_CONTRAST), inverse, 0)
-    coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
-    textured = view.inside & (contrast > CONTRAST)
-    return inverse, (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
 
 
 def compared(view: View, others: Sequence[View], masks: Sequence[Mask] | None = None) -> Others:

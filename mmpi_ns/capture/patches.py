@@ -96,7 +96,17 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
         if patches is None:
             start = torch.zeros(*shape, 3)
             start[..., 0] = torch.from_numpy(cv2.resize(rough, shape[::-1]))
-            guesses = [start, *_random_planes(rough, shape, pinhole, random)]
+            # And planes of any depth in the range of rough ones, facing the camera.
+            near, far = np.percentile(rough[rough > 0], [99, 1]) * [BEYOND, 1 / BEYOND]
+            size, (fx, fy, cx, cy) = (RANDOM, *shape), pinhole
+            q = far * (near / far) ** torch.rand(size, generator=random)
+            ahead, turn = torch.rand(size, generator=random), 2 * np.pi * torch.rand(size, generator=random)
+            aside = (1 - ahead * ahead).sqrt()
+            right, down = aside * turn.cos(), aside * turn.sin()
+            x, y = torch.arange(shape[1]) + 0.5 - cx, torch.arange(shape[0])[:, None] + 0.5 - cy
+            towards = right * x / fx + down * y / fy + ahead
+            scale = q / torch.where(towards < 0, towards.clamp(max=-GRAZING), towards.clamp(min=GRAZING))
+            guesses = [start, *torch.stack([q, scale * right / fx, scale * down / fy], -1)]
         else:
             guesses = [_resized(patches.planes, shape)]
         patches = Patches(guesses[0], torch.full(shape, -1.0))
@@ -108,20 +118,6 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
             patches = spread_planes(gray, patches, changes, pinhole, compared, STRIDE, offset)
     assert patches is not None
     return _certain(small, [other.reduced(smallest) for other in others], patches)
-
-
-def _random_planes(rough: Map, shape: tuple[int, ...], pinhole: Tensor, random: torch.Generator) -> Tensor:
-    """Planes of any depth in the range of rough ones, facing the camera. [N, h, w, 3]"""
-    near, far = np.percentile(rough[rough > 0], [99, 1]) * [BEYOND, 1 / BEYOND]
-    size, (fx, fy, cx, cy) = (RANDOM, *shape), pinhole
-    q = far * (near / far) ** torch.rand(size, generator=random)
-    ahead, turn = torch.rand(size, generator=random), 2 * np.pi * torch.rand(size, generator=random)
-    aside = (1 - ahead * ahead).sqrt()
-    right, down = aside * turn.cos(), aside * turn.sin()
-    x, y = torch.arange(shape[1]) + 0.5 - cx, torch.arange(shape[0])[:, None] + 0.5 - cy
-    towards = right * x / fx + down * y / fy + ahead
-    scale = q / torch.where(towards < 0, towards.clamp(max=-GRAZING), towards.clamp(min=GRAZING))
-    return torch.stack([q, scale * right / fx, scale * down / fy], -1)
 
 
 def _resized(planes: Tensor, shape: tuple[int, ...]) -> Tensor:

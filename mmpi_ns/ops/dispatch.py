@@ -23,7 +23,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import build
 from mmpi_ns.ops.layout import SMALL, Shapes, annotated, check_shapes
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, brief
 
 Route = Literal["auto", "torch", "native"]
 Form = Literal["reference", "cpu", "gpu"]
@@ -98,7 +98,7 @@ class Operation(Generic[P, R]):
             if not complaint and not isinstance(error, importlib.import_module("triton.errors").TritonError):
                 raise
             # A shape that the trial did not have; nothing has run.
-            reason = f"{self.name} does not compile for this GPU ({_words(error)})"
+            reason = f"{self.name} does not compile for this GPU ({type(error).__name__}: {brief(error)[:200]})"
             _faults[self.name] = _say(reason, f"Plain torch for {self.name}")
             return function(self.name, "reference")(*values)
 
@@ -277,7 +277,8 @@ def _try(name: str) -> str | None:
             compiler = Path(error.cmd[0]).name
             lacking = f"{compiler} cannot compile what starts Triton's kernels; its words are above"
         else:
-            return _say(f"its Triton kernel fails on this device ({_words(error)})", f"Plain torch for {name}")
+            words = f"{type(error).__name__}: {brief(error)[:200]}"
+            return _say(f"its Triton kernel fails on this device ({words})", f"Plain torch for {name}")
         _faults["Triton"] = _say(lacking)  # no other kernel will do better
         return lacking
     return None
@@ -286,12 +287,6 @@ def _try(name: str) -> str | None:
 @functools.cache
 def _announce() -> None:
     CONSOLE.print(f"Compiling kernels for {torch.cuda.get_device_name()}: about a minute, once.")
-
-
-def _words(error: Exception) -> str:
-    """First informative line of an error."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__}: {lines[0][:200]}" if lines else type(error).__name__
 
 
 def _say(reason: str, instead: str = "Plain torch instead of the compiled operations") -> str:

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
-from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.baked import shade_baked, show_baked
 from mmpi_ns.ops.blending import blended_optical_depth, log_shares
 from mmpi_ns.ops.ends import NEGLIGIBLE
@@ -44,12 +43,6 @@ AT_ONCE_BRICKS = 2**13
 """Bricks that are baked together."""
 AT_ONCE = 2**18
 """Rays whose weights are looked at together: all of a photo of 12 megapixels would take gigabytes."""
-
-
-def suits_bricks(model_field: MMPIField) -> bool:
-    """Decision of ``render auto`` for a field that is neither trained nor scored: bricks if compiled, on a CPU."""
-    compiled = dispatch.form_of("show_baked", model_field.features.data) == "cpu"
-    return compiled and not torch.is_grad_enabled() and not why_not_baked(model_field)
 
 
 @dataclass(frozen=True, eq=False)
