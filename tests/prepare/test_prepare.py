@@ -15,7 +15,7 @@ from reprojection import median_reprojection_error
 
 from mmpi_ns.capture.observe import read_observations
 from mmpi_ns.capture.sfm import find_sfm_model
-from mmpi_ns.prepare import features, mapping
+from mmpi_ns.prepare import features, mapping, pipeline
 from mmpi_ns.prepare.adjustment import camera_poses, similarity_between
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
@@ -137,7 +137,7 @@ def test_existing_scene_is_refused_and_left_alone(scene, capture):
 def test_interrupted_run_goes_on_without_redoing_what_was_done(capture, tmp_path, monkeypatch):
     settings = Settings(capture / "frames", tmp_path / "scene", threads=1, keep_work=True)
 
-    def interrupt(*args):
+    def interrupt(*args, **how):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
@@ -147,7 +147,7 @@ def test_interrupted_run_goes_on_without_redoing_what_was_done(capture, tmp_path
     assert not (tmp_path / "scene/transforms.json").exists()
     with monkeypatch.context() as patched:
         patched.setattr(features, "extract", interrupt)
-        patched.setattr(features, "match", interrupt)
+        patched.setattr(pipeline, "match_pairs", interrupt)
         prepare(settings)
         assert len(read_json(tmp_path / "scene")["frames"]) == COUNT
         with pytest.raises(KeyboardInterrupt):  # other features: what was kept does not fit
