@@ -51,7 +51,7 @@ AFTER = 2
 """Nearest neighbours from which objects are followed by optical flow."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
-SECONDS = 0.5
+SECONDS = 0.35
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
 """Share of an image that must be masked in one of them, or nothing is but people,"""
