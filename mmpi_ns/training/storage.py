@@ -24,7 +24,7 @@ FORMING = 0.4
 """Factor of the weight below which bricks are released while surfaces still form."""
 WORTH = 1.25
 """Least multiple of texels for which tables grow beyond the plan."""
-ROOM = 0.6
+ROOM = 0.4
 """Share of the planned memory that finer texels may fill: more learn single images (docs/log/texel-size.md)."""
 MOST_COPIED = 0.1
 """Share of the bricks that get a finer copy for their own errors; those beside them get one, too."""
