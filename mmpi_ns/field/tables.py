@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import Table, weigh_rows
+from mmpi_ns.ops.use import note_use
 from mmpi_ns.scene.bricks import grown_tiles, move_bricks, new_table, resample, tiles_with_copies
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
@@ -249,15 +250,8 @@ class TexelTables(Field):
             live: samples of each ray.
             errors: squared errors of the rays' colours, 0 where a ray has none.
         """
-        weights = weights.reshape(-1)[lookup.index]
-        sizes = [len(taps.positions) for taps in lookup.taps]
-        for taps, weight in zip(lookup.taps, weights.split(sizes), strict=True):
-            bricks = (lookup.rows // BRICK)[taps.positions.reshape(-1)]
-            self.peak.scatter_reduce_(0, bricks, weight.repeat_interleave(taps.positions.shape[1]), "amax")
-        if self.num_copies == 0:
-            shares = weights * errors[lookup.rays]
-            for taps, share in zip(lookup.taps, shares.split(sizes), strict=True):
-                self.gain.index_add_(0, lookup.rows[taps.positions[:, 0]] // BRICK, share)
+        gain = self.gain if self.num_copies == 0 else None
+        note_use(lookup.rows, lookup.taps, lookup.index, weights, errors, self.peak, gain)
         self.crossings += live.sum()
 
     @torch.no_grad()

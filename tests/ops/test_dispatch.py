@@ -18,7 +18,7 @@ from mmpi_ns.ops.layout import SceneLayout
 
 
 def test_every_form_of_an_operation_has_its_signature():
-    assert len(dispatch.operations()) == 26
+    assert len(dispatch.operations()) == 27
     for name, operation in dispatch.operations().items():
         for form in operation.compiled:
             if form == "gpu" and importlib.util.find_spec("triton") is None:

@@ -206,9 +206,11 @@ def test_a_bricks_peak_is_the_largest_weight_of_what_reads_it(taps):
             wanted[brick] = max(wanted[brick], weight)
 
     raised, index = peaks.clone(), index_rows(rows, 64 * 40)
-    lookup = SimpleNamespace(index=torch.arange(500), taps=[Taps(index.positions, weights)], rows=index.unique)
+    lookup = SimpleNamespace(
+        index=torch.arange(500), taps=[Taps(index.positions, torch.ones(rows.shape))], rows=index.unique
+    )
     tables = SimpleNamespace(peak=raised, num_copies=1, crossings=torch.tensor(0))
-    TexelTables.note_use(tables, lookup, weights, torch.ones(500, dtype=torch.long), torch.zeros(500))
+    TexelTables.note_use(tables, lookup, weights[:, None], torch.ones(500, dtype=torch.long), torch.zeros(500))
     assert torch.equal(raised, wanted) and not torch.equal(peaks, wanted)
 
 

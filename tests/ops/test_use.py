@@ -1,0 +1,135 @@
+"""What bricks are used for: compiled and plain against loops in float64 (ops/use)."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from compiled import compiled, normal  # noqa: F401
+
+from mmpi_ns.ops.gather import Taps
+from mmpi_ns.ops.interpolate import index_rows
+from mmpi_ns.ops.use import note_use
+from mmpi_ns.scene.texels import BRICK
+
+BRICKS, RAYS, SLOTS = 40, 90, 11
+
+
+def use(of_planes, of_cube=(), seed=0):
+    """Arguments of ``note_use``, of samples that read these rows of tables, in slots that rise among the planes and
+    again in the cube."""
+    g = torch.Generator().manual_seed(seed)
+    groups = [torch.as_tensor(x) for x in (of_planes, of_cube) if len(x)]
+    order = torch.randperm(RAYS * SLOTS, generator=g)[: sum(map(len, groups))]
+    slots = [x.sort().values for x in order.split([len(x) for x in groups])]
+    index = index_rows(torch.cat([torch.zeros(0, dtype=torch.int64), *(x.reshape(-1) for x in groups)]), BRICKS * BRICK)
+    positions = index.positions.split([x.numel() for x in groups])
+    taps = [Taps(p.view(x.shape), torch.ones(x.shape)) for p, x in zip(positions, groups, strict=True)]
+    weights, errors = normal(RAYS, SLOTS, seed=seed).abs(), normal(RAYS, seed=seed + 1).abs()
+    weights[:20] = 0
+    records = (0.1 * normal(BRICKS, seed=seed + 2).abs() for _ in range(2))
+    return index.unique, taps, torch.cat([order[:0], *slots]), weights, errors, *records
+
+
+def by_loops(rows, taps, slots, weights, errors, peak, gain):
+    """New peaks, and gains summed in float64."""
+    peaks, gains, slot = peak.tolist(), gain.tolist(), iter(slots.tolist())
+    for each in taps:
+        for read in rows[each.positions.long()].tolist():
+            ray, place = divmod(next(slot), SLOTS)
+            weight = float(weights[ray, place])
+            for row in read:
+                peaks[row // BRICK] = max(peaks[row // BRICK], weight)
+            gains[read[0] // BRICK] += weight * float(errors[ray])
+    return peaks, gains
+
+
+def cells(count, seed=0, most=BRICKS * BRICK):
+    """Rows of samples on planes: four neighbours in a brick or in four of them."""
+    g = torch.Generator().manual_seed(seed)
+    first = torch.randint(0, most - 9, (count, 1), generator=g) + torch.tensor([0, 1, 8, 9])
+    anywhere = torch.randint(0, most, (count, 4), generator=g)
+    return torch.where(torch.arange(count)[:, None] % 4 > 0, first, anywhere)
+
+
+CASES = {
+    "planes and cube": (cells(500), torch.cat([cells(300, seed=1), cells(300, seed=2)], 1)),
+    "planes alone": (cells(700, seed=3),),
+    "the cube alone": ((), torch.cat([cells(200, seed=4), cells(200, seed=5)], 1)),
+    "one brick": (7 * BRICK + cells(400, seed=6, most=BRICK),),
+    "one row": (torch.full((300, 4), 1234),),
+    "the first and the last row": (torch.tensor([[0, BRICKS * BRICK - 1] * 2] * 9),),
+    "one sample": (cells(1),),
+    "no sample": ((),),
+}
+
+
+def noted(function, arguments, threads=1):
+    """Peaks and gains afterwards."""
+    before, records = torch.get_num_threads(), [x.clone() for x in arguments[5:]]
+    try:
+        torch.set_num_threads(threads)
+        function(*arguments[:5], *records)
+    finally:
+        torch.set_num_threads(before)
+    return records
+
+
+@pytest.mark.parametrize("function", [note_use, note_use.reference])
+@pytest.mark.parametrize("case", CASES)
+def test_peaks_and_gains_are_those_of_loops(function, case):
+    arguments = use(*CASES[case])
+    (peak, gain), (peaks, gains) = noted(function, arguments), by_loops(*arguments)
+    assert peak.tolist() == peaks and gain.tolist() == pytest.approx(gains, rel=1e-6)
+    if len(arguments[2]) > 1:
+        assert (peak > arguments[5]).any() and (gain > arguments[6]).any()
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+@pytest.mark.parametrize("case", CASES)
+def test_bits_are_those_of_plain_torch_for_any_number_of_threads(monkeypatch, case, threads):
+    monkeypatch.setattr("mmpi_ns.ops.use.AT_LEAST", 50)
+    arguments = use(*CASES[case], seed=3)
+    for a, b in zip(noted(note_use, arguments, threads), noted(note_use.reference, arguments), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_gains_may_be_left_out():
+    *arguments, peak, gain = use(*CASES["planes and cube"])
+    left_out, both = peak.clone(), peak.clone()
+    note_use(*arguments, left_out, None)
+    note_use(*arguments, both, gain)
+    assert torch.equal(left_out, both) and not torch.equal(both, peak)
+
+
+@pytest.mark.parametrize("function", [note_use, note_use.reference])
+def test_samples_without_weight_change_nothing(function):
+    rows, taps, slots, weights, *rest = use(*CASES["planes and cube"])
+    arguments = (rows, taps, slots, 0 * weights, *rest)
+    assert all(torch.equal(a, b) for a, b in zip(noted(function, arguments), rest[1:], strict=True))
+
+
+@pytest.mark.parametrize("function", [note_use, note_use.reference])
+def test_a_weight_that_is_not_a_number_is_seen_and_stays(function):
+    rows, taps, slots, weights, *rest = use(CASES["one row"][0])
+    weights.view(-1)[slots[5]] = math.nan
+    peak, gain = noted(function, (rows, taps, slots, weights, *rest))
+    assert peak.isnan().nonzero().tolist() == gain.isnan().nonzero().tolist() == [[1234 // BRICK]]
+
+
+def changed(name):
+    """Arguments of which one has another shape."""
+    rows, taps, slots, weights, errors, peak, gain = use(CASES["planes alone"][0])
+    return {
+        "slots": (rows, taps, slots[1:], weights, errors, peak, gain),
+        "errors": (rows, taps, slots, weights, errors[1:], peak, gain),
+        "gain": (rows, taps, slots, weights, errors, peak, gain[1:]),
+        "taps": (rows, [Taps(t.positions[:, :3], t.weights[:, :3]) for t in taps], slots, weights, errors, peak, gain),
+    }[name]
+
+
+@pytest.mark.parametrize("name", ["slots", "errors", "gain", "taps"])
+def test_arrays_of_a_wrong_shape_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name} (has the shape|of)"):
+        note_use(*changed(name))
