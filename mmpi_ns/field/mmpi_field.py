@@ -19,7 +19,7 @@ from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
 from mmpi_ns.field.tables import Lookup, TexelTables
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
-from mmpi_ns.ops.gather import COLORS, RaySums, Taps, gather_places, gather_taps
+from mmpi_ns.ops.gather import RaySums, Taps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MergedSamples
@@ -258,30 +258,19 @@ class MMPIField(TexelTables):
             feature_weight: of colours and features.
             chroma_times: how many times more than they already do differences of chroma count in the gradient.
         """
-        total, features = self.density.new_zeros(()), lookup.features
-        if chroma_times > 0 and features.requires_grad:
-            features = features.view_as(features)  # a node of its own: the hook sees this loss's gradient alone
-            # Chroma is three colours less their mean.
-            features.register_hook(
-                lambda gradient: torch.cat(
-                    [
-                        (colors := gradient[:, :COLORS]) + chroma_times * (colors - colors.mean(-1, keepdim=True)),
-                        gradient[:, COLORS:],
-                    ],
-                    -1,
-                )
-            )
+        total = self.density.new_zeros(())
         if (scales := self.cached("resolution")) is None:
             longest = ((max(grid.width, grid.height), grid) for grid in self.grids)
             sides = [(g.width, g.height, g.depth) if g.is_cube else (side, side, g.depth) for side, g in longest]
             resolution = torch.tensor(sides, dtype=torch.float32, device=total.device) / 128
             scales = self.cached("resolution", lambda: resolution)
-        for table, values, weight in (
-            (self.density, lookup.density, density_weight),
-            (self.features, features, feature_weight),
+        for table, values, weight, chroma in (
+            (self.density, lookup.density, density_weight, 0.0),
+            (self.features, lookup.features, feature_weight, chroma_times),
         ):
             if weight > 0:
-                total = total + weight * total_variation(values, table.data, lookup.rows, self.layout, scales)
+                term = total_variation(values, table.data, lookup.rows, self.layout, scales, chroma)
+                total = total + weight * term
         return total
 
     def sample_shares(self, rays: RayBundle, samples: MergedSamples, lookup: Lookup) -> tuple[Tensor, Tensor]:

@@ -141,7 +141,7 @@ def _variations(device: str, shapes: Shapes) -> list[tuple]:
         for channels in (1, shapes.channels):
             table = 3 * _random(device, len(layout.grids[0].places) * BRICK, channels)
             scales = torch.tensor([(0.5, 2.0, 1.0)] * layout.num_heads, device=device)
-            cases.append((table[rows].requires_grad_(), table, rows, layout, scales))
+            cases.append((table[rows].requires_grad_(), table, rows, layout, scales, 3.0 * (channels > 1)))
     return cases
 
 

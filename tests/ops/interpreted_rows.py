@@ -101,8 +101,8 @@ def test_texels_are_those_of_the_grids_also_at_borders_and_outside():
         assert torch.equal(rows[own], wanted_rows) and torch.allclose(weights[own], wanted_weights, atol=2e-6)
 
 
-@pytest.mark.parametrize("channels", [1, 9])
-def test_variation_equals_the_reference_with_its_gradient(channels):
+@pytest.mark.parametrize(("channels", "chroma"), [(1, 0.0), (9, 0.0), (3, 2.5), (9, 2.5)])
+def test_variation_equals_the_reference_with_its_gradient(channels, chroma):
     grids, _, _ = thinned(SHAPES)
     layout = layout_of(SHAPES, grids[0].tiles)
     table = normal(len(grids[0].places) * 64, channels) * 2
@@ -111,7 +111,7 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     scales, found = torch.tensor([(0.5 + k, 2.0, 1.0) for k in range(len(grids))]), []
     for function, dtype in ((total_variation, torch.float32), (total_variation.reference, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
-        value = function(values, table.to(dtype), rows, layout, scales)
+        value = function(values, table.to(dtype), rows, layout, scales, chroma)
         (3 * value).backward()
         found.append((value.item(), values.grad.double()))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-5) and found[0][0] > 1

@@ -27,7 +27,7 @@ WRONG_AT = {
     "a picture of one MPI without a cube": ("show_rays", lambda layout, *_: layout.num_heads == 1),
     "eight channels": ("gather_taps", lambda values, *_: values.shape[1] == 8),
     "one channel": ("total_variation", lambda values, *_: values.shape[1] == 1),
-    "no cube": ("total_variation", lambda values, table, rows, layout, scales: layout.cube is None),
+    "no cube": ("total_variation", lambda values, table, rows, layout, *_: layout.cube is None),
 }
 RUN = Shapes((1, 9), cube=False)
 

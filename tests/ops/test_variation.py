@@ -16,8 +16,8 @@ from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK
 
 
-@pytest.mark.parametrize("channels", [1, 8, 9])
-def test_variation_equals_the_reference_with_its_gradient(channels):
+@pytest.mark.parametrize(("channels", "chroma"), [(1, 0.0), (8, 0.0), (9, 0.0), (3, 2.5), (8, 2.5), (20, 2.5)])
+def test_variation_equals_the_reference_with_its_gradient(channels, chroma):
     cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (3, 2, 4))
     plan = ScenePlan((make_mpi("a", height=5, width=4, planes=3), make_mpi("b", height=2, width=3)), cube, 0.05, 1.0)
     layout = MMPIField(plan).layout
@@ -28,7 +28,7 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     found, scales = [], torch.tensor([(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)])
     for function in (total_variation, total_variation.reference):
         values = table[rows].requires_grad_()
-        value = function(values, table, rows, layout, scales)
+        value = function(values, table, rows, layout, scales, chroma)
         (3 * value).backward()
         found.append((value.item(), values.grad))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-5) and found[0][0] > 1
@@ -46,8 +46,28 @@ def test_variation_of_no_texels_is_zero():
         assert function(table[rows], table, rows, layout, scales) == 0
 
 
-@pytest.mark.parametrize("channels", [1, 8, 9])
-def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(channels):
+@pytest.mark.parametrize("function", [total_variation, total_variation.reference])
+@pytest.mark.parametrize("channels", [3, 8, 20])
+def test_differences_of_chroma_count_more_in_the_gradient_and_not_in_the_value(function, channels):
+    layout = layout_of([(3, 7, 6), (2, 5, 9)])
+    table = 2 * normal(len(layout.grids[0].places) * BRICK, channels)
+    rows, scales = torch.cat([g.rows for g in layout.grids]).sort()[0], torch.tensor([(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
+    exact, fast = table[rows].double().requires_grad_(), table[rows].requires_grad_()
+    wanted = total_variation.reference(exact, table.double(), rows, layout, scales)
+    wanted.backward()
+    value = function(fast, table, rows, layout, scales, 50.0)
+    (3 * value + fast.sum()).backward()
+    gradient = []
+    for row in exact.grad.tolist():
+        mean = sum(row[:3]) / 3
+        gradient.append([3 * (x + 50 * (x - mean)) + 1 for x in row[:3]] + [3 * x + 1 for x in row[3:]])
+    assert value.item() == pytest.approx(wanted.item(), rel=1e-6)
+    assert torch.allclose(fast.grad.double(), torch.tensor(gradient, dtype=torch.float64), rtol=1e-5, atol=2e-4)
+    assert (fast.grad - exact.grad).abs().max() > 50
+
+
+@pytest.mark.parametrize(("channels", "chroma"), [(1, 0.0), (8, 0.0), (9, 0.0), (8, 5.0)])
+def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(channels, chroma):
     layout = layout_of([(3, 70, 60), (2, 50, 41)])
     grids = layout.grids
     table = normal(len(grids[0].places) * BRICK, channels) * 2
@@ -58,17 +78,17 @@ def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(chann
         values = table[rows].requires_grad_()
         try:
             torch.set_num_threads(count)
-            value = total_variation(values, table, rows, layout, scales)
+            value = total_variation(values, table, rows, layout, scales, chroma)
             value.backward()
         finally:
             torch.set_num_threads(threads)
         found.append((value, values.grad))
     assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
     values = table[rows].double().requires_grad_()
-    wanted = total_variation.reference(values, table.double(), rows, layout, scales)
+    wanted = total_variation.reference(values, table.double(), rows, layout, scales, chroma)
     wanted.backward()
     assert found[0][0].item() == pytest.approx(wanted.item(), rel=1e-6)
-    assert torch.allclose(found[0][1].double(), values.grad, atol=2e-6)
+    assert torch.allclose(found[0][1].double(), values.grad, atol=2e-6 * (1 + chroma))
 
 
 @pytest.mark.parametrize(("rows", "values", "heads", "more"), [(9, 8, 1, 0), (9, 9, 2, 0), (9, 9, 1, 64)])

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.layout import SceneLayout, dense
 
 
@@ -20,6 +21,7 @@ def total_variation(
     rows: Int[Tensor, "U"],
     layout: SceneLayout,
     scales: Float[Tensor, "H 3"],
+    chroma: float = 0.0,
 ) -> Float[Tensor, ""]:
     """Huber loss of the differences of distinct texels with their stored neighbours in the same head.
 
@@ -29,14 +31,24 @@ def total_variation(
         rows: where they came from, those of a brick together; none of a brick's that lie beyond the border of a plane.
         layout: of the scene.
         scales: weight of a difference along x, y and z, of each head.
+        chroma: how many times more than they already do differences of chroma count in the gradient.
     """
     total = values.new_zeros(())
+    if chroma > 0 and values.requires_grad:
+        values = values.view_as(values)  # a node of its own: the hook sees this loss's gradient alone
+        values.register_hook(lambda gradient: weigh_chroma(gradient, chroma))
     for grid, each in zip(layout.grids, scales, strict=True):
         inside = grid.holds(rows).nonzero()[:, 0]
         neighbours, exists = grid.neighbours(rows[inside])
         weights = exists * each.repeat_interleave(2)
         total = total + clamped_differences(values[inside], table[neighbours], weights)
     return total
+
+
+def weigh_chroma(gradient: Float[Tensor, "N C"], times: float) -> Float[Tensor, "N C"]:
+    """Gradients of texels whose part along chroma, three colours less their mean, counts ``times`` times more."""
+    colors = gradient[:, :COLORS]
+    return torch.cat([colors + times * (colors - colors.mean(-1, keepdim=True)), gradient[:, COLORS:]], -1)
 
 
 def clamped_differences(
@@ -76,10 +88,12 @@ PART = 4096
 
 
 @total_variation.on_cpu
-def total_variation_on_cpu(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Tensor) -> Tensor:
+def total_variation_on_cpu(
+    values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Tensor, chroma: float = 0.0
+) -> Tensor:
     gradient, totals = torch.empty_like(values), torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
     inputs = (rows.contiguous(), len(rows), table.shape[1], table, len(table), layout.cpu_grids, layout.num_heads)
-    outputs = (gradient, totals)
+    weights, outputs = (*dense(scales), float(chroma)), (gradient, totals)
     places = layout.grids[0].places
-    call_in_parts("mmpi_total_variation", len(totals), *inputs, places, *dense(scales), *outputs, least=1)
+    call_in_parts("mmpi_total_variation", len(totals), *inputs, places, *weights, *outputs, least=1)
     return WithGradient.apply(values, totals.sum().to(values.dtype), gradient)  # type: ignore[no-any-return]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, grids_of, is_stored, launch, row_of, texel_of
 from mmpi_ns.ops.layout import SceneLayout, dense
-from mmpi_ns.ops.variation import WithGradient
+from mmpi_ns.ops.variation import WithGradient, weigh_chroma
 
 ROWS = 128
 """Texels of a program."""
@@ -44,7 +44,9 @@ def variation_kernel(
     tl.store(totals + tl.program_id(0), tl.sum(tl.sum(total, 1), 0))
 
 
-def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Tensor) -> Tensor:
+def total_variation(
+    values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Tensor, chroma: float = 0.0
+) -> Tensor:
     (count, channels), device, block = values.shape, values.device, block_size(ROWS, values.device)
     gradient, totals = torch.empty_like(values), torch.zeros(max(1, triton.cdiv(count, block)), device=device)
     tensors = (rows.contiguous(), values.contiguous(), table, grids_of(layout), *dense(scales), gradient, totals)
@@ -52,4 +54,6 @@ def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLa
         variation_kernel, count, block, *tensors, count, channels, NUM_HEADS=len(scales),
         CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
     )  # fmt: skip
+    if chroma > 0:
+        gradient = weigh_chroma(gradient, chroma)
     return WithGradient.apply(values, totals.sum(), gradient)  # type: ignore[no-any-return]

@@ -1,7 +1,6 @@
 // Total variation of texels with its gradient.
 #include "parts.h"
-#include "scene.h"
-#include "table.h"
+#include "taps.h"
 
 #include <vector>
 
@@ -64,8 +63,14 @@ void add_difference(Lanes center, Lanes other, float scale, Lanes& slope, Lanes&
     value += scale * clamped * (difference - 0.5f * clamped);
 }
 
+// Slopes whose part along chroma, three colours less their mean, counts `times` times more (weigh_chroma).
+Lanes weigh_chroma(Lanes slope, float times) {
+    const float mean = (slope[0] + slope[1] + slope[2]) / COLORS;
+    return IOTA < float(COLORS) ? slope + times * (slope - mean) : slope;
+}
+
 // Lanes are channels, sixteen at a time. `grad` has room for sixteen numbers more than it takes.
-Lanes vary(const Table& table, const Group& group, const float* scale, float* grad) {
+Lanes vary(const Table& table, const Group& group, const float* scale, float chroma, float* grad) {
     Lanes total{};
     const int64_t channels = table.channels;
     for (int64_t i = 0; i < group.size; i++)
@@ -74,6 +79,7 @@ Lanes vary(const Table& table, const Group& group, const float* scale, float* gr
             const Lanes center = table.read(group.rows[i][0] * channels + first);
             for (int k = 0; k < 6; k++)
                 add_difference(center, table.read(group.rows[i][k + 1] * channels + first), scale[k / 2], slope, value);
+            if (chroma > 0 && first == 0) slope = weigh_chroma(slope, chroma);
             store(grad + i * channels + first, slope); // what lies beyond the row is overwritten by the next one
             total += IOTA < float(channels - first) ? value : Lanes{};
         }
@@ -82,10 +88,11 @@ Lanes vary(const Table& table, const Group& group, const float* scale, float* gr
 
 // Huber loss of the differences of texels with their stored neighbours, and its gradient [count, channels], which holds
 // neighbours fixed. Works on parts [begin, end) of PART rows each and writes the loss of each. Rows of a brick should
-// come together. `places` names the tile of every brick, `scales` are those of x, y and z of each head.
+// come together. `places` names the tile of every brick, `scales` are those of x, y and z of each head, `chroma` is for
+// weigh_chroma.
 void mmpi_total_variation(int64_t begin, int64_t end, const int64_t* rows, int64_t count, int64_t channels,
                           const float* numbers, int64_t table_rows, const Grid* grids, int64_t num_heads,
-                          const int64_t* places, const float* scales, float* grad, double* totals) {
+                          const int64_t* places, const float* scales, float chroma, float* grad, double* totals) {
     const Table table{numbers, table_rows, channels};
     std::vector<float> scratch(WIDTH * channels + WIDTH);
     Surroundings at;
@@ -122,7 +129,7 @@ void mmpi_total_variation(int64_t begin, int64_t end, const int64_t* rows, int64
             }
             const float each[3] = {scales[3 * group.head] / 6, scales[3 * group.head + 1] / 6,
                                    scales[3 * group.head + 2] / 6};
-            const Lanes value = vary(table, group, each, scratch.data());
+            const Lanes value = vary(table, group, each, chroma, scratch.data());
             std::copy(scratch.data(), scratch.data() + group.size * channels, to);
             for (int i = 0; i < WIDTH; i++) total += value[i];
         }
