@@ -9,7 +9,7 @@ with each other, and the images between them only where something moves near the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,6 +49,9 @@ ROUNDS = (2, 1)
 """Of dense matching: at half the size, then at that size."""
 AFTER = 2
 """Nearest neighbours from which objects are followed by optical flow."""
+FURTHER, SIDES, ASIDE = 2, 8, 0.005
+"""Times that objects are followed from image to image at the sides of a drive, at most; the part of an image's width
+that is its side, on the left and on the right, and the share of an image that must have been masked there since."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.35
@@ -61,7 +64,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 14
+VERSION = 15
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -112,13 +115,21 @@ def find_moving(
         masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
         again = [i for i in first if any(masks[j].any() for j in near[i])]
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i]), again))
+        seen = masks.copy()
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
+        masks = _followed_aside(shots, near, masks, seen, {i: first[i] for i in again}, pool)
     # Whatever moves comes close at some time; what is found where nothing moves is mostly small. Walkers may stay away.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         walkers = {i: knowledge.walkers for i, knowledge in first.items() if knowledge.walkers.any()}
         masks = [walkers[i] if i in walkers and len(walkers) >= WALKERS else nothing[i] for i in range(len(masks))]
     return [shot.view for shot in shots], masks, doubt_of(shots, up, masks)
+
+
+def reaches_side(mask: Mask) -> bool:
+    """Whether a mask covers much of an image's left or right side."""
+    side = mask.shape[1] // SIDES
+    return max(int(mask[:, :side].sum()), int(mask[:, -side:].sum())) > ASIDE * mask.size
 
 
 def neighbours(images: PosedImages, i: int, keys: Sequence[int]) -> list[int]:
@@ -290,5 +301,37 @@ def _moves(
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow) & ~static
-        core |= carried(shot, others, [masks[j] for j in near]) & ~static
+        carry = carried(shot, others, [masks[j] for j in near], masks[i])
+        core |= (carry.pixels | carry.objects) & ~static
     return grown(shot, shown, core | uprights), first
+
+
+def _followed_aside(
+    shots: Sequence[Shot],
+    near: Sequence[Sequence[int]],
+    masks: list[Mask],
+    before: list[Mask],
+    first: Mapping[int, _First],
+    pool: ThreadPoolExecutor,
+) -> list[Mask]:
+    """Masks [h, w] with objects that enter or leave images at the side, next to images in which such are masked now and
+    were not ``before``; of the images that ``first`` knows."""
+    for _ in range(FURTHER):
+        aside = [reaches_side(mask & ~old) for mask, old in zip(masks, before, strict=True)]
+        part, before = [i for i in first if any(aside[j] for j in near[i][:AFTER])], masks
+        arrived = pool.map(lambda i: _arrived(shots, near[i], i, before, first[i]), part)  # noqa: B023
+        masks = list(before)
+        for i, mask in zip(part, arrived, strict=True):
+            masks[i] = masks[i] | mask
+    return masks
+
+
+def _arrived(shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], first: _First) -> Mask:
+    """Whole objects of its neighbours that an image shows unmasked; arguments as for ``_moves``. [h, w]"""
+    shot, moving = shots[i], [masks[j] for j in near]
+    others = [Neighbour.of(shot, shots[j], gain) for j, gain in zip(near, first.gains, strict=True)]
+    core = carried(shot, others, moving, masks[i]).objects
+    if not core.any():
+        return core
+    shown = evidence(shot, others, moving, first.swept.impossible)
+    return grown(shot, shown, core & ~is_static(shot, shown))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving_carry import carried
+from mmpi_ns.capture.moving import reaches_side
+from mmpi_ns.capture.moving_carry import carried, whole_objects
 from mmpi_ns.capture.moving_evidence import Neighbour, Shot
 from mmpi_ns.capture.views import View
 
@@ -65,7 +66,7 @@ def a_path(speed: float) -> tuple[Shot, list[Neighbour], list[np.ndarray], list[
 def test_a_car_that_leaves_the_image_is_followed_to_it(speed):
     """It comes towards the camera, keeps its distance, or overtakes."""
     shot, others, (car, standing), masks = a_path(speed)
-    inner = carried(shot, others, [boxes[0] for boxes in masks])
+    inner = carried(shot, others, [boxes[0] for boxes in masks], np.zeros(SIZE, bool)).pixels
     around = cv2.dilate(car.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     assert car[:, 0].any(), "the test's car does not leave"
     assert inner[car].mean() > 0.2 and not inner[~around].any() and not inner[standing].any()
@@ -74,10 +75,34 @@ def test_a_car_that_leaves_the_image_is_followed_to_it(speed):
 def test_what_one_image_takes_for_a_mover_by_mistake_is_not_followed():
     shot, others, (_, standing), masks = a_path(1.0)
     nothing = np.zeros(SIZE, bool)
-    assert not carried(shot, others, [masks[0][1], *[nothing] * 3])[standing].any()
+    carry = carried(shot, others, [masks[0][1], *[nothing] * 3], nothing)
+    assert not (carry.pixels | carry.objects)[standing].any()
 
 
 def test_nothing_is_followed_where_nothing_moves_or_there_is_no_ground():
     shot, others, _, masks = a_path(1.0)
-    assert not carried(shot, others, [np.zeros(SIZE, bool)] * 4).any()
-    assert not carried(replace(shot, ground=None), others, [boxes[0] for boxes in masks]).any()
+    nothing = np.zeros(SIZE, bool)
+    for carry in (
+        carried(shot, others, [nothing] * 4, nothing),
+        carried(replace(shot, ground=None), others, [boxes[0] for boxes in masks], nothing),
+    ):
+        assert not carry.pixels.any() and not carry.objects.any()
+
+
+def test_a_car_without_texture_is_taken_as_a_whole():
+    """Pixels that move are a third of it, scattered; the horizon is in row 30 of 80, and it reaches up to it."""
+    horizon_at_30 = np.repeat(np.maximum(np.arange(80) - 29, 0)[:, None], 120, 1).astype(np.float32)
+    car, curb = np.zeros((2, 80, 120), bool)
+    car[32:70, 0:30], curb[58:80, 60:100] = True, True
+    scattered = np.random.default_rng(0).random(car.shape) < 0.33
+    nothing = np.zeros_like(car)
+    whole = whole_objects(scattered & (car | curb), horizon_at_30, nothing)
+    assert whole[car].mean() > 0.9 and not whole[curb].any()
+    assert not whole_objects(scattered & car, horizon_at_30, car).any()  # masked already
+    assert not whole_objects(scattered & car & (np.arange(120) < 6), horizon_at_30, nothing).any()  # too small
+
+
+def test_images_next_to_what_is_newly_masked_at_a_side_are_looked_at_again():
+    side, middle, strip = np.zeros((3, 80, 160), bool)
+    side[20:60, :10], middle[20:60, 60:100], strip[20:22, -10:] = True, True, True
+    assert reaches_side(side) and reaches_side(side[:, ::-1]) and not reaches_side(middle) and not reaches_side(strip)
