@@ -348,9 +348,7 @@ def _start_from(task: Task, name: str, focals: Mapping[int, float]) -> Path:
     with pycolmap.Database.open(database) as opened:
         for camera in opened.read_all_cameras():
             if camera.camera_id in focals:
-                params = camera.params.copy()
-                params[camera.focal_length_idxs()] = focals[camera.camera_id]
-                camera.params = params
+                camera.params[camera.focal_length_idxs()] = focals[camera.camera_id]
                 opened.update_camera(camera)
     return database
 

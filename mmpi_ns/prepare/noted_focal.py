@@ -24,9 +24,7 @@ def with_focals(model: pycolmap.Reconstruction, focals: Mapping[int, float], thr
     held = copy.deepcopy(model)
     for number, camera in held.cameras.items():
         if number in focals:
-            params = camera.params.copy()
-            params[camera.focal_length_idxs()] = focals[number]
-            camera.params = params
+            camera.params[camera.focal_length_idxs()] = focals[number]
     for _ in range(ROUNDS):
         adjust(held, threads, lens=True, focal=False)
     return held
