@@ -205,10 +205,11 @@ class MMPIModel(Model):
         if not self.training:
             return self.image_outputs(ray_bundle)
         progress, field, bundle, asked = self.progress, self.field, ray_bundle, len(ray_bundle)
-        head_mask, choose, num_mpis = None, None, len(field.plan.mpis)
+        phase, head_mask, choose = progress.schedule.phase_at(progress.step).name, None, None
+        num_mpis = len(field.plan.mpis)
         move_rays(bundle, self.camera_optimizer)
         bundle = bounded(bundle, field.plan)
-        if progress.phase.name == "individual" and num_mpis > 1:
+        if phase == "individual" and num_mpis > 1:
             # Rays for one of the MPIs that they meet, or for every MPI in turn, and for the cube (paper sec. III-C).
             if self.config.schedule.rays_per_mpi == "split":
                 g = generator(self.config.seed, progress.step, "assignment", self.device)
@@ -218,7 +219,7 @@ class MMPIModel(Model):
                 head_mask = torch.arange(field.plan.num_heads, device=self.device) == heads[:, None]
                 head_mask[:, num_mpis:].fill_(True)
                 bundle = bundle.broadcast_to((num_mpis, asked)).flatten()
-        blends = "reliability" in TRAINS[progress.phase.name] and self.blends(field)
+        blends = "reliability" in TRAINS[phase] and self.blends(field)
         options = self.config.sampling.options(field.plan, not progress.schedule.sharpened(progress.step), blends)
         rays = render_rays(bundle, field, options, head_mask, choose)
         return {"training": replace(rays, times=len(bundle) // asked)}

@@ -24,7 +24,7 @@ from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training.initial import start_from_depths
-from mmpi_ns.training.phases import TRAINS, Phase, Schedule
+from mmpi_ns.training.phases import TRAINS, Schedule
 from mmpi_ns.training.storage import prepare_storage
 from mmpi_ns.utils.files import to_bytes, to_text
 
@@ -90,10 +90,6 @@ class Progress(nn.Module):
         self.register_buffer("windows_bytes", to_bytes(windows.to_json()))
         self.register_buffer("schedule_bytes", to_bytes(schedule.to_json()))
         self.register_buffer("window_number", torch.tensor(0))
-
-    @property
-    def phase(self) -> Phase:
-        return self.schedule.phase_at(self.step)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Plan and schedule of a run come from its checkpoint, whatever config and capture say now."""
@@ -180,7 +176,7 @@ class TrainingRun:
                 self._drawn_from = window
                 if step == window * schedule.window_steps and manager.sources is not None:
                     start_from_depths(field, manager.sources, manager.config.seed)
-        phase = progress.phase.name
+        phase = schedule.phase_at(step).name
         field.learns_cover = phase == "individual"
         for kind, params in groups.items():
             params[0].requires_grad_(kind in TRAINS[phase])
