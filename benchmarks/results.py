@@ -70,10 +70,10 @@ class Results(SceneBench):
 
 def error_figures(errors: PixelErrors) -> dict[str, float]:
     """Medians and 90th percentiles over the observations, each in its best head; fraction outside all heads."""
-    served = np.isfinite(errors.combined.min(-1))
+    served, heads = np.isfinite(errors.combined.min(-1)), errors.combined.argmin(-1)
     figures = {"unserved": float(1 - served.mean()) if len(served) else 0.0}
     for name, values in (("e_p", errors.plane), ("e_t", errors.texel)):
-        best = np.take_along_axis(values, errors.best[:, None], -1)[served, 0]
+        best = np.take_along_axis(values, heads[:, None], -1)[served, 0]
         for q in (50, 90):
             figures[f"{name}_{q}"] = float(np.percentile(best, q)) if len(best) else float("nan")
     return figures

@@ -34,11 +34,6 @@ class PixelErrors:
         """[Q, K] both combined: a sample is displaced by at most e_p and half a texel."""
         return np.hypot(self.plane, 0.5 * self.texel)
 
-    @property
-    def best(self) -> NDArray[np.int64]:
-        """[Q] the head that serves each observation best."""
-        return self.combined.argmin(-1)
-
 
 def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> PixelErrors:
     """e_p and e_t of observed points [Q, 3], each seen by a camera [Q], in every head of a plan: its MPIs, then the

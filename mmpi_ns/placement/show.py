@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from numpy.typing import NDArray
 
-from mmpi_ns.placement.errors import WORST, PixelErrors, pixel_errors
+from mmpi_ns.placement.errors import WORST, pixel_errors
 from mmpi_ns.placement.observations import Array, Observations, VisiblePoints
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import WindowedPlan
@@ -35,25 +36,26 @@ class PlanReport:
     """Share of the observations that nothing holds."""
     overlap: float
     """Heads that hold an observation, on average."""
-    errors: PixelErrors
+    best: NDArray[np.int64]
+    """[Q] head that serves each observation best,"""
     served_errors: Array
-    """[Q] expected pixel error of each observation in the head that serves it best; ``WORST`` where none does."""
+    """[Q] and its expected pixel error there; ``WORST`` where none holds it."""
 
 
 def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints) -> PlanReport:
     """Shares and expected errors of every head, over the observations that placement weighs."""
-    errors = pixel_errors(plan, observations, visible.cameras, visible.points)
-    combined, weights = np.minimum(errors.combined, WORST), visible.weights / visible.weights.sum()
-    held, figures = np.isfinite(errors.combined), np.full((3, plan.num_heads), np.nan)
+    errors = pixel_errors(plan, observations, visible.cameras, visible.points).combined
+    combined, weights = np.minimum(errors, WORST), visible.weights / visible.weights.sum()
+    held, best, figures = np.isfinite(errors), errors.argmin(-1), np.full((3, plan.num_heads), np.nan)
     for k in range(plan.num_heads):
-        served = (errors.best == k) & held.any(-1)
+        served = (best == k) & held.any(-1)
         rest = np.delete(combined[served], k, axis=1).min(-1, initial=WORST)
         figures[0, k] = weights[served].sum()
         if served.any():
             figures[1:, k] = np.median(combined[served, k]), np.median(rest)
     shares, error_with, error_without = figures
     unserved, overlap = float(weights[~held.any(-1)].sum()), float(held.sum(-1) @ weights)
-    return PlanReport(shares, error_with, error_without, unserved, overlap, errors, combined.min(-1))
+    return PlanReport(shares, error_with, error_without, unserved, overlap, best, combined.min(-1))
 
 
 def table(plan: ScenePlan, observations: Observations, report: PlanReport) -> str:
@@ -169,9 +171,8 @@ def draw_errors(path: Path, plan: ScenePlan, report: PlanReport) -> None:
     """Writes a histogram (PNG) of the expected pixel error, coloured by the MPI that serves each observation."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.add_subplot(xlabel="expected error, pixels", ylabel="observations", xscale="log")
-    errors, best = report.served_errors, report.errors.best
-    bins = np.geomspace(0.1, WORST, 49)
-    values = [np.clip(errors[best == k], bins[0], WORST) for k in range(len(plan.names))]
+    errors, bins = report.served_errors, np.geomspace(0.1, WORST, 49)
+    values = [np.clip(errors[report.best == k], bins[0], WORST) for k in range(len(plan.names))]
     colors = [COLORS[k % len(COLORS)] if k < len(plan.mpis) else "black" for k in range(len(plan.names))]
     axes.hist(values, bins=bins.tolist(), stacked=True, color=colors, label=list(plan.names))
     axes.axvline(float(np.median(errors)), color="black", linestyle="--", linewidth=0.8)
