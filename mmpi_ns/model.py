@@ -323,6 +323,9 @@ class MMPIModel(Model):
         folder = self.config.windows_folder
         if self.config.rendering.nearest_images and folder is not None and not self.trains:
             self.details = details_of(folder.parent / DETAILS_FOLDER, step)
+            if self.details is None:
+                say("This checkpoint has no details of the training images (they are made after the last step): images "
+                    "show the field alone.")  # fmt: skip
 
     @property
     def chunk_size(self) -> int:

@@ -11,7 +11,7 @@ import second_device
 import torch
 from training_runs import trainer_config
 
-from mmpi_ns.rendering.details import has_details
+from mmpi_ns.rendering.details import details_of
 from mmpi_ns.scene.plan import ScenePlan
 
 STEPS = 24
@@ -35,7 +35,7 @@ def train(scene: Path, plan: Path, output: Path, device: str, load_dir: Path | N
     torch.manual_seed(0)
     trainer.setup()
     trainer.train()
-    assert has_details(trainer.base_dir / "details", STEPS - 1)
+    assert details_of(trainer.base_dir / "details", STEPS - 1) is not None
     return trainer
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
-from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -32,7 +31,7 @@ from mmpi_ns.capture.cache import write_arrays
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH, seen_details
 from mmpi_ns.scene.near_views import nearest_views
-from mmpi_ns.utils.errors import InputError, brief, say
+from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import write_atomically
 
 MAX_ANGLE = 45.0
@@ -154,22 +153,11 @@ def _load(path: Path, *names: str) -> list[Tensor]:
         ) from error
 
 
-def has_details(folder: Path, step: int) -> bool:
-    """Whether a folder holds the details that belong to the checkpoint of a step."""
-    with suppress(InputError):  # damaged
-        return (folder / CAMERAS_FILE).is_file() and read_details(folder)[0] == step
-    return False
-
-
-def details_of(folder: Path | None, step: int) -> Details | None:
-    """The details of a run that belong to its checkpoint of a step; None, with a sentence, if it has none."""
-    if folder is not None and (folder / CAMERAS_FILE).is_file():
-        kept_at, details = read_details(folder)
-        if kept_at == step:
-            return details
-    say("This checkpoint has no details of the training images (they are made after the last step): images show the "
-        "field alone.")  # fmt: skip
-    return None
+def details_of(folder: Path, step: int) -> Details | None:
+    """The details of a run that belong to its checkpoint of a step; None if it has none. Raises InputError if they are
+    damaged."""
+    kept_at, details = read_details(folder) if (folder / CAMERAS_FILE).is_file() else (None, None)
+    return details if kept_at == step else None
 
 
 def moved_cameras(cameras: Cameras, poses: CameraOptimizer) -> Cameras:

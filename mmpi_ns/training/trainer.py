@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from nerfstudio.utils import comms, writer
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.capture.new_views import image_and_mask
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
-from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, has_details, moved_cameras, write_details
+from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
 from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
@@ -230,7 +230,8 @@ class MMPITrainer(Trainer):
             shows_details = cast(Any, self.pipeline.model).config.rendering.nearest_images
             is_last = self._start_step == self._total_steps
             lacks = is_last and shows_details and self._last_step in checkpoints_in(self.checkpoint_dir)
-            lacks = lacks and not has_details(self.base_dir / DETAILS_FOLDER, self._last_step)
+            with suppress(InputError):  # damaged ones are made again
+                lacks = lacks and details_of(self.base_dir / DETAILS_FOLDER, self._last_step) is None
             left = "details of its training images are made" if lacks else "nothing to do"
             say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
             if lacks:
@@ -333,7 +334,7 @@ class MMPITrainer(Trainer):
         cameras = moved_cameras(images.cameras.to(model.device), model.camera_optimizer)
         render = model.get_outputs_for_camera_ray_bundle
         say(write_details(folder, step, cameras, model.exposures.factors, partial(image_and_mask, images), render))
-        model.details = details_of(folder, step) if has_details(folder, step) else None
+        model.details = details_of(folder, step)
 
     # Checkpoints --------------------------------------------------------------------------------------------------
 

@@ -4,6 +4,7 @@ details of another checkpoint."""
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH
 from mmpi_ns.rendering.details import (
     LARGEST,
@@ -160,10 +162,19 @@ def test_moved_cameras_are_where_their_rays_are():
 
 
 def test_details_of_another_checkpoint_are_not_shown(tmp_path, capsys):
-    write(tmp_path, joined(camera()), [random_planes(0, 4.0)], step=7)
-    assert details_of(tmp_path, 7) is not None
-    assert details_of(tmp_path, 8) is None
+    folder = tmp_path / "details"
+    write(folder, joined(camera()), [random_planes(0, 4.0)], step=7)
+    assert details_of(folder, 7) is not None
+    assert details_of(folder, 8) is None
     assert details_of(tmp_path / "none", 7) is None
+    config = MMPIModelConfig()
+    config.windows_folder = tmp_path / "windows"
+    model = SimpleNamespace(config=config, trains=False, details=None)
+    capsys.readouterr()
+    MMPIModel.update_to_step(model, 7)
+    assert model.details is not None and not capsys.readouterr().out
+    MMPIModel.update_to_step(model, 8)
+    assert model.details is None
     assert "images show the field alone" in " ".join(capsys.readouterr().out.split())
 
 
