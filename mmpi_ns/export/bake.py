@@ -97,7 +97,14 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         kept = smoothed(replace(whole, seen=peaks.sum((1, 2))).keep(seen), peaks[seen])
         print(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen.")
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
-    path = poses_of(pipeline)
+    poses = {}  # of all cameras, training and test, by image name
+    for dataset, test in ((pipeline.datamanager.train_dataset, False), (pipeline.datamanager.eval_dataset, True)):
+        for i, image in enumerate(dataset.image_filenames):
+            camera = dataset.cameras[i]
+            focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
+            size = (int(camera.width), int(camera.height))
+            poses[str(image)] = Pose(camera.camera_to_worlds.tolist(), size, focal, center, test)
+    path = [poses[image] for image in sorted(poses)]
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
     name = Path(pipeline.datamanager.get_datapath()).resolve().name
     return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows, views, nearest)
@@ -118,18 +125,6 @@ def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
     channels = zip(mpis.texels.unbind(-1), slacks, strict=True)
     texels = list(in_order(lambda channel: smoothed_codes(*channel, beside), channels))
     return replace(window, mpis=replace(mpis, texels=torch.stack(texels, -1), packed={}))
-
-
-def poses_of(pipeline: Any) -> list[Pose]:
-    """All cameras of a capture, training and test, in the order of their image names, as pinholes."""
-    poses = {}
-    for dataset, test in ((pipeline.datamanager.train_dataset, False), (pipeline.datamanager.eval_dataset, True)):
-        for i, name in enumerate(dataset.image_filenames):
-            camera = dataset.cameras[i]
-            focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
-            size = (int(camera.width), int(camera.height))
-            poses[str(name)] = Pose(camera.camera_to_worlds.tolist(), size, focal, center, test)
-    return [poses[name] for name in sorted(poses)]
 
 
 @torch.no_grad()
