@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,7 +13,7 @@ from mmpi_ns.placement.defaults import DEFAULTS, check_placement, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
 from mmpi_ns.utils.errors import InputError, quoted
-from mmpi_ns.utils.host import enter_command
+from mmpi_ns.utils.host import enter_command, values_of
 
 if TYPE_CHECKING:
     from mmpi_ns.placement.observations import Observations
@@ -111,9 +110,7 @@ def _mark(plan: Path) -> str:
 def entrypoint() -> None:
     """The command ``mmpi-plan``; a problem with the scene or the plan ends it with one sentence and status 1."""
     say_version("mmpi-plan")
-    # The placement of the method that the arguments name.
-    words = [w for argument in sys.argv[1:] for w in argument.split("=", 1)]
-    method = words[words.index("--method") + 1] if "--method" in words[:-1] else ""
+    method = next(iter(values_of("--method")), "mmpi-small")
     usual = DEFAULTS.get(method, DEFAULTS["mmpi-small"]).placement
     default = PlanCommand(tyro.MISSING, tyro.MISSING, placement=usual)
     command = tyro.cli(PlanCommand, default=default, description=PlanCommand.__doc__)
