@@ -212,12 +212,11 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     if used > MOST_MOTION:
         remedy = f"raise --max-frames above {max_frames} or cut the video into shorter ones"
         say(f"{used:.0%} of the width between frames is much: {remedy}.", "yellow")
-    capture, _ = _open(video)
-    photos = []
+    capture, photos = cv2.VideoCapture(str(video)), []
     with progress("Writing frames", len(chosen)) as advance:
         for index in range(chosen[-1] + 1):
             if not capture.grab():
-                raise InputError(f"{video} could be read to frame {index - 1} this time: it changed, or is damaged.")
+                raise InputError(f"{video} could be read for {index} frames this time: it changed, or is damaged.")
             if index != chosen[len(photos)]:
                 continue
             _, frame = capture.retrieve()
@@ -238,9 +237,11 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
 def measure(video: Path) -> tuple[list[float], list[float]]:
     """First pass, with two small frames in memory: motion of each since the one before over the width, and sharpness.
     Raises InputError if the video cannot be read."""
-    capture, total = _open(video)
-    motion, sharp = [], []
-    last = None
+    capture = cv2.VideoCapture(str(video))
+    if not capture.isOpened():
+        raise InputError(f"{video} cannot be opened as a video: it is damaged, or its codec is unknown here.")
+    total = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+    motion, sharp, last = [], [], None
     with progress("Reading the video", total or None) as advance:
         while True:
             ok, frame = capture.read()
@@ -259,13 +260,6 @@ def measure(video: Path) -> tuple[list[float], list[float]]:
     if total and len(motion) < 0.9 * total:
         say(f"{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.", "yellow")
     return motion, sharp
-
-
-def _open(video: Path) -> tuple[cv2.VideoCapture, int]:
-    capture = cv2.VideoCapture(str(video))
-    if not capture.isOpened():
-        raise InputError(f"{video} cannot be opened as a video: it is damaged, or its codec is unknown here.")
-    return capture, max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
 
 
 def median_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
