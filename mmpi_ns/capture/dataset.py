@@ -242,11 +242,12 @@ class LocalNerfstudio(Nerfstudio):
     """The parser asks no question on the terminal where ``transforms.json`` names no point cloud."""
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        def subtract(meta: dict[str, Any], path: Path) -> None:
+        def subtract(meta: dict[str, Any], path: Path) -> dict[str, Any]:
             self._origin = LocalOrigin(meta, path)
             if any("mask_path" in frame for frame in meta["frames"]):
                 for frame in meta["frames"]:
                     frame.setdefault("mask_path", NO_MASK)
+            return meta
 
         with transforms_changed(nerfstudio_dataparser, subtract):
             outputs = super()._generate_dataparser_outputs(split)

@@ -169,19 +169,13 @@ def give_back_freed_memory() -> None:
 
 
 @contextmanager
-def transforms_changed(parser: ModuleType, change: Callable[[dict[str, Any], Path], None]) -> Iterator[None]:
-    """Within the block nerfstudio's parser sees a transforms.json after ``change``, which edits its content in place.
+def transforms_changed(parser: ModuleType, change: Callable[[Any, Path], Any]) -> Iterator[None]:
+    """Within the block nerfstudio's parser sees what ``change`` makes of the content of a transforms.json.
 
     The parser reads the file and rounds to float32 in one function: this is the only place between.
     """
     read = parser.load_from_json
-
-    def read_and_change(path: Path) -> dict[str, Any]:
-        meta = read(path)
-        change(meta, path)
-        return meta
-
-    parser.load_from_json = read_and_change  # type: ignore[attr-defined]
+    parser.load_from_json = lambda path: change(read(path), path)  # type: ignore[attr-defined]
     try:
         yield
     finally:

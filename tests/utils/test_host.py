@@ -189,7 +189,7 @@ def test_a_transforms_file_is_changed_within_the_block_alone(tmp_path):
     read = nerfstudio_dataparser.load_from_json
     with (
         pytest.raises(KeyError),
-        host.transforms_changed(nerfstudio_dataparser, lambda meta, path: meta.update(b=path.name)),
+        host.transforms_changed(nerfstudio_dataparser, lambda meta, path: meta | {"b": path.name}),
     ):
         assert nerfstudio_dataparser.load_from_json(tmp_path / "t.json") == {"a": 1, "b": "t.json"}
         raise KeyError
