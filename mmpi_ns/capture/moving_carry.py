@@ -35,7 +35,7 @@ BETTER = 0.1
 """Correlation of what moves over that of what stands, at least: one neighbour shows each."""
 COHERENT = 1.1
 """Steps by which an inverse depth may differ from the median around it."""
-SCATTERED, CLOSED, LEAST_PIXELS = 3.0, 13, 300
+SCATTERED, CLOSED, LEAST_PIXELS = 3.0, 13, 450
 """The same within a whole object, pixels across which what moves there is one, and those of an object, at half the
 size."""
 NEW, UP = 0.3, 0.2
