@@ -53,7 +53,7 @@ class Carried:
 
 
 def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], mask: Mask) -> Carried:
-    """Searches what moves in its nearest neighbours in a shot.
+    """What moves in the nearest neighbours of a shot, where the shot shows it.
 
     Args:
         shot: the image.
