@@ -4,15 +4,19 @@ mover by mistake."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
+from mmpi_ns.capture import moving
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving import reaches_side
 from mmpi_ns.capture.moving_carry import carried, whole_objects
 from mmpi_ns.capture.moving_evidence import Neighbour, Shot
+from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View
 
 SIZE, FOCAL, HEIGHT = (160, 240), 200.0, 1.5
@@ -106,3 +110,33 @@ def test_images_next_to_what_is_newly_masked_at_a_side_are_looked_at_again():
     side, middle, strip = np.zeros((3, 80, 160), bool)
     side[20:60, :10], middle[20:60, 60:100], strip[20:22, -10:] = True, True, True
     assert reaches_side(side) and reaches_side(side[:, ::-1]) and not reaches_side(middle) and not reaches_side(strip)
+
+
+def test_an_object_at_the_side_is_followed_on_from_image_to_image_twice(monkeypatch):
+    """Five images in a row, of which the second pass masks the first one's side and another one's middle."""
+    view = View(np.zeros((20, 50), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((20, 50), bool))
+    shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), Depth(*np.zeros((2, 20, 50), np.float32)), None)] * 5
+    poses = np.tile(np.eye(4)[:3], (5, 1, 1))
+    poses[:, 0, 3] = 0, 2, 3, 5, 8
+    images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile([50.0, 20], (5, 1)), np.zeros((5, 4)))
+    side, middle, speck = np.zeros((3, 20, 50), bool)
+    side[:, :4], middle[:, 20:30], speck[0, 20] = True, True, True
+    asked = []
+
+    def moves(shots, near, i, masks, uprights, first):
+        return speck if first is None else (side | speck, speck, speck, speck, middle)[i], SimpleNamespace(
+            walkers=speck
+        )
+
+    def arrived(shots, near, i, masks, first):
+        asked.append(i)
+        return side
+
+    for name, value in (
+        ("find_depths", lambda *_: iter(shots)), ("people_in", lambda *_: np.zeros((0, 4), int)), ("_moves", moves),
+        ("_arrived", arrived), ("neighbours", lambda images, i, keys: [j for j in (i - 1, i + 1) if 0 <= j < 5]),
+    ):  # fmt: skip
+        monkeypatch.setattr(moving, name, value)
+    _, masks, _ = moving.find_moving(images, lambda i: np.zeros((0, 3)))
+    assert [bool(mask[:, 0].all()) for mask in masks] == [True, True, True, False, False]
+    assert sorted(asked) == [0, 1, 2] and masks[2][0, 20] and masks[4][0, 25]

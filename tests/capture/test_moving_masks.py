@@ -17,6 +17,7 @@ from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving import WALKERS, find_moving, gain_of, in_image
+from mmpi_ns.capture.moving_carry import Carried
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import (
     LEAST_LEVELS,
@@ -87,22 +88,25 @@ def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_i
 
 
 def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed_or_a_person(monkeypatch):
-    """One row: swept, followed by flow, a seed, a person, each with a static pixel and one that is not."""
-    swept, followed_pixels, seed, person, static = (np.zeros((1, 8), bool) for _ in range(5))
-    swept[0, :2] = followed_pixels[0, 2:4] = seed[0, 4:6] = person[0, 6:] = static[0, ::2] = True
+    """One row: swept, by flow, a seed, a person, along the path, as an object: a static pixel and one that is not."""
+    swept, followed_pixels, seed, person, static, pixels, objects = (np.zeros((1, 12), bool) for _ in range(7))
+    swept[0, :2] = followed_pixels[0, 2:4] = seed[0, 4:6] = person[0, 6:8] = static[0, ::2] = True
+    pixels[0, 8:10] = objects[0, 10:] = True
     monkeypatch.setattr(moving.Neighbour, "of", lambda *_: None)
     sweeps = moving.Sweep(swept, swept)
     for name, value in (
         ("gain_of", None), ("sweep", sweeps), ("evidence", None), ("is_static", static), ("seeds", seed),
-        ("followed", followed_pixels),
+        ("followed", followed_pixels), ("carried", Carried(pixels, objects)),
     ):  # fmt: skip
         monkeypatch.setattr(moving, name, lambda *_, value=value: value)
     monkeypatch.setattr(moving, "grown", lambda shot, shown, core: core)
-    masks = [np.ones((1, 8), bool)] * 3
-    nothing = Depth(*np.zeros((2, 1, 8), np.float32))
-    shot = Shot(View(np.zeros((1, 8), np.uint8), np.ones(4), np.eye(4)[:3], static), np.zeros((1, 8, 3)), nothing, None)
+    masks = [np.ones((1, 12), bool)] * 3
+    nothing = Depth(*np.zeros((2, 1, 12), np.float32))
+    shot = Shot(
+        View(np.zeros((1, 12), np.uint8), np.ones(4), np.eye(4)[:3], static), np.zeros((1, 12, 3)), nothing, None
+    )
     core, _ = moving._moves([shot] * 3, [1, 2], 0, masks, person, None)
-    assert core[0].tolist() == [False, True, False, True, True, True, True, True]
+    assert core[0].tolist() == [*[False, True] * 2, *[True] * 4, *[False, True] * 2]
 
 
 def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):

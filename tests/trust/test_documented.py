@@ -1,10 +1,12 @@
-"""docs/errors.md: each of its sentences is in the code, each error of the code is there, and each row names a test."""
+"""docs/errors.md has the sentences of the code, its errors, and a test for each; pages of the top level are links."""
 
 from __future__ import annotations
 
 import ast
 import re
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[2]
 ERRORS = ("InputError", "WriteError", "Damaged")
@@ -62,3 +64,9 @@ def test_every_row_names_a_test_that_exists():
     text = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
     missing = [name for _, name in rows() if not re.search(rf"^def {name}\(", text, re.MULTILINE)]
     assert len(list(rows())) > 60 and not missing, missing
+
+
+@pytest.mark.parametrize("name", ["CHANGELOG.md", "CONTRIBUTING.md"])
+def test_pages_of_the_top_level_are_links(name):
+    """A copy in docs/ falls behind; editors that replace a file make one of a link."""
+    assert (ROOT / "docs" / name).readlink() == Path("..") / name
