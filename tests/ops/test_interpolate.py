@@ -157,13 +157,6 @@ def test_distinct_rows_are_those_of_the_reference(count, spread):
     assert fast.positions.shape == rows.shape and torch.equal(fast.unique[fast.positions.long()], rows)
 
 
-def test_rows_of_a_table_too_large_to_mark_are_sorted():
-    rows = torch.tensor([2**40, 3, 2**40, 2**31])
-    index = index_rows(rows, 2**40 + 1)
-    assert torch.equal(index.unique, torch.tensor([3, 2**31, 2**40]))
-    assert torch.equal(index.unique[index.positions.long()], rows)
-
-
 @pytest.mark.parametrize("channels", [1, 9])
 def test_rows_gather_what_their_entries_give(channels):
     rows = torch.randint(0, 40, (300, 4), generator=torch.Generator().manual_seed(1))

@@ -18,8 +18,6 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
-MOST_ROWS = 2**31
-"""A bit is taken for every row of the table: beyond this, torch's sort."""
 AT_LEAST = 1 << 15
 """Entries, samples or bricks that are worth another thread, whose start takes as long as a tenth of a millisecond."""
 
@@ -240,8 +238,6 @@ def texel_rows_on_cpu(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: T
 @index_rows.on_cpu
 def index_rows_on_cpu(rows: Tensor, table_rows: int, pads: bool = False) -> RowIndex:
     count, listed = rows.numel(), rows.long().contiguous()
-    if table_rows > MOST_ROWS or not 0 < count < 2**31:
-        return index_rows.reference(rows, table_rows, pads)
     words = torch.zeros(-(-table_rows // BRICK), dtype=torch.int64)
     before, positions = torch.empty(len(words), dtype=torch.int32), torch.empty(rows.shape, dtype=torch.int32)
     call_in_parts("mmpi_mark_rows", count, listed, words, least=AT_LEAST)
@@ -257,9 +253,7 @@ def index_rows_on_cpu(rows: Tensor, table_rows: int, pads: bool = False) -> RowI
 
 @sum_rows.on_cpu
 def sum_rows_on_cpu(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
-    if positions.dtype != torch.int32:
-        return sum_rows.reference(positions, values, weights, count)
-    sums, entries = torch.empty(count, values.shape[1]), (x.contiguous() for x in (positions, weights, values))
-    bounds = owned_bounds([positions], count, AT_LEAST)
+    entries = (x.contiguous() for x in (positions.to(torch.int32), weights, values))
+    sums, bounds = torch.empty(count, values.shape[1]), owned_bounds([positions], count, AT_LEAST)
     call_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
     return sums

@@ -49,16 +49,9 @@ def note_use(
 def note_use_on_cpu(
     rows: Tensor, taps: list[Taps], slots: Tensor, weights: Tensor, errors: Tensor, peak: Tensor, gain: Tensor | None
 ) -> None:
-    if any(each.positions.dtype != torch.int32 for each in taps):
-        return note_use.reference(rows, taps, slots, weights, errors, peak, gain)
     (rows, slots), of_rays = dense(rows, slots, dtype=torch.int64), dense(weights, errors)
     for each, here in zip(taps, slots.split([len(each.positions) for each in taps]), strict=True):
-        bounds = _brick_bounds(rows, each.positions)
-        samples = (each.positions.contiguous(), *each.positions.shape, here)
+        first, *inner, last = owned_bounds([each.positions], len(rows), AT_LEAST)
+        bounds = [first, *torch.searchsorted(rows, rows[inner] // BRICK * BRICK).tolist(), last]  # divide no brick
+        samples = (each.positions.to(torch.int32).contiguous(), *each.positions.shape, here)
         call_in_parts("mmpi_note_use", bounds, rows, *samples, *of_rays, weights.shape[1], peak, gain)
-
-
-def _brick_bounds(rows: Int[Tensor, "U"], positions: Int[Tensor, "N B"]) -> list[int]:
-    """``owned_bounds`` that divide no brick."""
-    first, *inner, last = owned_bounds([positions], len(rows), AT_LEAST)
-    return [first, *torch.searchsorted(rows, rows[inner] // BRICK * BRICK).tolist(), last]
