@@ -7,7 +7,6 @@ namespace {
 
 constexpr int FINENESS = 8, COLORS = 3;
 constexpr int32_t CORNERS[4] = {0, 1, 8, 9}; // of a cell, texels within a brick
-typedef uint8_t ByteLanes __attribute__((vector_size(16)));
 typedef uint16_t ShortLanes __attribute__((vector_size(32)));
 
 struct BakedScene {

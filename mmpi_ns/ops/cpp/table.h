@@ -15,6 +15,12 @@ template <typename T> inline void prefetch_row(const T* row, int64_t channels) {
 constexpr int64_t OCTET = 8;
 typedef float Octet __attribute__((vector_size(32)));
 
+inline Octet load_octet(const float* from) {
+    Octet x;
+    __builtin_memcpy(&x, from, sizeof x);
+    return x;
+}
+
 inline Lanes join(Octet a, Octet b) {
     return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 }
@@ -25,10 +31,7 @@ inline Octet upper_half(Lanes x) { return __builtin_shufflevector(x, x, 8, 9, 10
 // to += share * from.
 inline void add_row(float* to, const float* from, float share, int64_t channels) {
     if (channels == OCTET) {
-        Octet sum, given;
-        __builtin_memcpy(&sum, to, sizeof sum);
-        __builtin_memcpy(&given, from, sizeof given);
-        sum += share * given;
+        const Octet sum = load_octet(to) + share * load_octet(from);
         __builtin_memcpy(to, &sum, sizeof sum);
     } else
         for (int64_t c = 0; c < channels; c++) to[c] += share * from[c];
@@ -44,11 +47,7 @@ struct Table {
     }
 
     // A row of eight numbers.
-    Octet octet(int64_t row) const {
-        Octet x;
-        __builtin_memcpy(&x, numbers + row * OCTET, sizeof x);
-        return x;
-    }
+    Octet octet(int64_t row) const { return load_octet(numbers + row * OCTET); }
 
     // Sixteen numbers from `at` on; those beyond the table are 0.
     Lanes read(int64_t at) const {

@@ -2,8 +2,6 @@
 #include "parts.h"
 
 #include <cmath>
-#include <cstdint>
-#include <vector>
 
 namespace {
 

@@ -1,26 +1,16 @@
 // Motion of overlapping patches of an image to another one that looks nearly alike, by least squares.
-#include "lanes.h"
 #include "parts.h"
+#include "table.h"
 
 #include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <cstring>
 #include <vector>
 
 namespace {
 
-typedef float Row __attribute__((vector_size(32)));
-constexpr int SIDE = 8, BORDER = SIDE + 1; // as in __init__.py
+constexpr int SIDE = OCTET, BORDER = SIDE + 1; // as in __init__.py
 constexpr float PIXELS = SIDE * SIDE, FLAT = 16, FAR_APART = 0.25f * 0.25f, FARTHEST = 8 * 8;
 
-Row load_row(const float* from) {
-    Row x;
-    std::memcpy(&x, from, sizeof x);
-    return x;
-}
-
-float sum(Row x) { return ((x[0] + x[1]) + (x[2] + x[3])) + ((x[4] + x[5]) + (x[6] + x[7])); }
+float sum(Octet x) { return ((x[0] + x[1]) + (x[2] + x[3])) + ((x[4] + x[5]) + (x[6] + x[7])); }
 
 // An image in floats, with pixels of the border around it.
 struct Padded {
@@ -50,14 +40,14 @@ struct Motion {
 // A patch of an image, its gradients less their means, and the inverse of their products' sums.
 struct Patch {
     const int64_t row, column;
-    Row gray[SIDE], right[SIDE], down[SIDE];
+    Octet gray[SIDE], right[SIDE], down[SIDE];
     float xx = FLAT, xy = 0, yy = FLAT;
 
     Patch(const Padded& image, int64_t row, int64_t column) : row(row), column(column) {
-        Row across[SIDE + 2], smooth[SIDE + 2], all_right{}, all_down{}, a{}, b{}, c{};
+        Octet across[SIDE + 2], smooth[SIDE + 2], all_right{}, all_down{}, a{}, b{}, c{};
         for (int n = 0; n < SIDE + 2; n++) {
             const float* from = image.at(row + n - 1, column);
-            const Row before = load_row(from - 1), middle = load_row(from), after = load_row(from + 1);
+            const Octet middle = load_octet(from), before = load_octet(from - 1), after = load_octet(from + 1);
             across[n] = after - before;
             smooth[n] = before + 2.0f * middle + after;
             if (n > 0 && n <= SIDE) gray[n - 1] = middle;
@@ -88,10 +78,10 @@ struct Patch {
         const float y = std::clamp(row + at.down, 1.0f - SIDE, other.height - 1.0f);
         const float left = std::floor(x), top = std::floor(y), u = x - left, v = y - top;
         const float* from = other.at(int64_t(top), int64_t(left));
-        const auto between = [&](const float* at) { return load_row(at) + u * (load_row(at + 1) - load_row(at)); };
-        Row above = between(from);
+        const auto between = [&](const float* at) { return load_octet(at) + u * (load_octet(at + 1) - load_octet(at)); };
+        Octet above = between(from);
         for (int n = 0; n < SIDE; n++) {
-            const Row below = between(from += other.stride);
+            const Octet below = between(from += other.stride);
             each(n, above + v * (below - above) - gray[n]);
             above = below;
         }
@@ -99,8 +89,8 @@ struct Patch {
 
     // Sum of squared differences less their mean; and the step that makes it least, if it is asked for.
     float error(const Padded& other, Motion at, Motion* step) const {
-        Row all{}, squares{}, along{}, across{};
-        differences(other, at, [&](int n, Row apart) {
+        Octet all{}, squares{}, along{}, across{};
+        differences(other, at, [&](int n, Octet apart) {
             all += apart;
             squares += apart * apart;
             along += apart * right[n];
@@ -177,7 +167,7 @@ void mmpi_refine_motion(int64_t, int64_t, const uint8_t* gray, const uint8_t* ot
             }
             if (best.right != mine.right || best.down != mine.down)
                 best = patch.descended(other, best, rounds, least);
-            patch.differences(other, best, [&](int n, Row apart) {
+            patch.differences(other, best, [&](int n, Octet apart) {
                 const int64_t at = (i * stride + n) * width + j * stride;
                 for (int k = 0; k < SIDE; k++) {
                     const float weight = 1.0f / std::max(1.0f, std::fabs(apart[k]));

@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
 
 namespace {
 
@@ -132,9 +131,7 @@ struct Pixels {
             squares += value * value;
         }
         best = read(planes, row, column);
-        float each[WIDTH] = {};
-        std::memcpy(each, correlations + row * of.width + column, count * sizeof(float));
-        alike = load(each);
+        alike = load_some<Lanes>(correlations + row * of.width + column, count);
     }
 
     // Planes of pixels from a place on; where the image has none, of the nearest in the row.

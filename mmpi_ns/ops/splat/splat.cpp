@@ -21,8 +21,6 @@ struct Seen {
     int32_t left, right, top, bottom, index;
 };
 
-float within(float x, float limit) { return std::min(std::max(x, -limit), limit); }
-
 // False where it is not seen.
 bool project(const View& view, const float* mean, const float* covariance, float alpha, Seen& seen) {
     float at[3] = {0, 0, 0}, axes[3][3]; // rows: right, down, ahead
@@ -33,8 +31,8 @@ bool project(const View& view, const float* mean, const float* covariance, float
         }
     const float z = at[2];
     if (!(z > NEAREST) || alpha < FAINTEST) return false;
-    const float tx = within(at[0] / z, ASIDE * float(view.width) / (2 * view.fx));
-    const float ty = within(at[1] / z, ASIDE * float(view.height) / (2 * view.fy));
+    const float aside = ASIDE * float(view.width) / (2 * view.fx), above = ASIDE * float(view.height) / (2 * view.fy);
+    const float tx = std::clamp(at[0] / z, -aside, aside), ty = std::clamp(at[1] / z, -above, above);
     float bend[2][3], half[2][3];
     for (int j = 0; j < 3; j++) {
         bend[0][j] = view.fx / z * (axes[0][j] - tx * axes[2][j]);
