@@ -34,10 +34,6 @@ inline int64_t row_in_brick(int32_t brick, int64_t y, int64_t x) {
     return int64_t(brick) * BRICK + ((y & 7) << 3) + (x & 7);
 }
 
-inline int64_t row_of(const Grid& grid, int64_t z, int64_t y, int64_t x) {
-    return row_in_brick(*grid.tile(z, y, x), y, x);
-}
-
 struct Cube {
     float lower[3], extent[3]; // extent = upper - lower
     float step, bias, interval;
@@ -89,22 +85,17 @@ inline float blend(const float* table, const Corners& corners, const Cell& x, co
     return gx * gy * table[row[0]] + fx * gy * table[row[1]] + gx * fy * table[row[2]] + fx * fy * table[row[3]];
 }
 
-inline float bilinear(const float* table, const Grid& grid, int64_t layer, const Cell& x, const Cell& y) {
-    return blend(table, Corners(grid, layer, y.lower, x.lower), x, y);
-}
-
 inline float trilinear(const float* table, const Grid& grid, const float* ndc) {
     const Cell x(ndc[0], grid.width), y(ndc[1], grid.height), z(ndc[2], grid.depth);
-    return bilinear(table, grid, z.lower, x, y) * (1 - z.fraction) +
-           bilinear(table, grid, z.lower + 1, x, y) * z.fraction;
+    const Corners front(grid, z.lower, y.lower, x.lower), back(grid, z.lower + 1, y.lower, x.lower);
+    return blend(table, front, x, y) * (1 - z.fraction) + blend(table, back, x, y) * z.fraction;
 }
 
 inline int64_t nearest_texel(const Grid& grid, const float* ndc) {
-    const int64_t sizes[3] = {grid.width, grid.height, grid.depth};
-    int64_t index[3];
-    for (int i = 0; i < 3; i++) {
-        const float last = float(sizes[i] - 1);
-        index[i] = int64_t(std::min(std::max(std::nearbyint((ndc[i] + 1) * (0.5f * last)), 0.0f), last));
-    }
-    return row_of(grid, index[2], index[1], index[0]);
+    const auto nearest = [](float coordinate, int64_t size) {
+        const float last = float(size - 1);
+        return int64_t(std::min(std::max(std::nearbyint((coordinate + 1) * (0.5f * last)), 0.0f), last));
+    };
+    const int64_t x = nearest(ndc[0], grid.width), y = nearest(ndc[1], grid.height);
+    return row_in_brick(*grid.tile(nearest(ndc[2], grid.depth), y, x), y, x);
 }

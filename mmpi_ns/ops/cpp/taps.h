@@ -12,15 +12,13 @@ struct Sample {
     // At a place in a head: on one of its planes, or anywhere in the cube.
     void put(const Grid& grid, bool in_cube, int64_t plane, const float* ndc) {
         const Cell x(ndc[0], grid.width), y(ndc[1], grid.height), z(ndc[2], grid.depth);
-        put_plane(grid, in_cube ? z.lower : plane, x, y, in_cube ? 1 - z.fraction : 1);
-        if (in_cube) put_plane(grid, z.lower + 1, x, y, z.fraction);
-    }
-
-    void put_plane(const Grid& grid, int64_t layer, const Cell& x, const Cell& y, float share) {
-        const Corners corners(grid, layer, y.lower, x.lower);
-        for (int i = 0; i < 4; i++) {
-            rows[taps] = corners.row[i];
-            shares[taps++] = (i & 1 ? x.fraction : 1 - x.fraction) * (i >> 1 ? y.fraction : 1 - y.fraction) * share;
+        for (int behind = 0; behind <= in_cube; behind++) {
+            const Corners corners(grid, (in_cube ? z.lower : plane) + behind, y.lower, x.lower);
+            const float share = !in_cube ? 1 : behind ? z.fraction : 1 - z.fraction;
+            for (int i = 0; i < 4; i++) {
+                rows[taps] = corners.row[i];
+                shares[taps++] = (i & 1 ? x.fraction : 1 - x.fraction) * (i >> 1 ? y.fraction : 1 - y.fraction) * share;
+            }
         }
     }
 };

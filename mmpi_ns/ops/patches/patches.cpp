@@ -3,8 +3,6 @@
 #include "parts.h"
 
 #include <algorithm>
-#include <cmath>
-#include <cstdint>
 
 namespace {
 
