@@ -21,11 +21,11 @@ from PIL import Image
 from mmpi_ns.bench.trainers import JOINT, NO_TRACKS, P, Scene, Steps, train_words
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.layout import EVERY, SMALL
+from mmpi_ns.ops.trial import DRIVER
 from mmpi_ns.utils.machine import processor
 
 STEPS, RAYS = 20, 1024
 """Steps that are timed, and rays of each."""
-DRIVER = Path("/proc/driver/nvidia/version")
 
 
 @dataclass

@@ -21,16 +21,7 @@ from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.march import Rays
 from mmpi_ns.scene import geometry
-from mmpi_ns.scene.baked import (
-    CELLS,
-    MOST_CHANNELS,
-    SIDE,
-    BakedMpis,
-    Codes,
-    Shader,
-    brick_numbers,
-    columns_from,
-)
+from mmpi_ns.scene.baked import CELLS, MOST_CHANNELS, SIDE, BakedMpis, Codes, Shader, brick_numbers, columns_from
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
 

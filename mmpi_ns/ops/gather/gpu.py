@@ -39,9 +39,7 @@ def _read_taps(values, positions, shares, number, inside, channels, column, TAPS
 
 
 # Arrays that are parts of others begin anywhere, and no variant is compiled for those that happen to be aligned.
-@triton.jit(
-    do_not_specialize=("num_rays", "slots", "planar", "positions", "shares", "cube_positions", "cube_shares"),
-)
+@triton.jit(do_not_specialize=("num_rays", "slots", "planar", "positions", "shares", "cube_positions", "cube_shares"))
 def gather_kernel(
     values, numbers, weights, positions, shares, cube_positions, cube_shares, sums, num_rays, slots, channels, planar,
     HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,

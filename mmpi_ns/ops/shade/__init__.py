@@ -39,8 +39,6 @@ class SampleNetworks(NamedTuple):
 
 def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tensor, "N E"]:
     """(x, sin 2^i pi x, cos 2^i pi x) for i < frequencies (NeRF eq. 4)."""
-    if frequencies == 0:
-        return x
     octaves = math.pi * 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)
     angles = (x[:, None, :] * octaves[:, None]).flatten(1)
     return torch.cat([x, angles.sin(), angles.cos()], -1)
