@@ -16,6 +16,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.texels import BRICK
 
 # Columns of an MPI's row in ``SceneLayout.constants``.
 ORIGIN, AXES, EXTENT, STEP, END, LAST = map(tl.constexpr, (0, 3, 12, 16, 17, 18))
@@ -24,6 +25,8 @@ SHARE, S_SCALE, U0, U_SCALE, V0, V_SCALE, INTERVAL, FLOATS = map(tl.constexpr, r
 # tile, and the tile of the first brick of all, are.
 FIRST_TILE, DEPTH, HEIGHT, WIDTH, BIAS, DOWN, ACROSS = map(tl.constexpr, range(7))
 BRICK_OF_TILE, TILE_OF_BRICK, INTS = map(tl.constexpr, range(7, 10))
+STORED = tl.constexpr(BRICK)
+"""A row found by ``row_of`` is stored from here on."""
 
 
 def grids_of(layout: SceneLayout) -> Int[Tensor, "N"]:
@@ -86,12 +89,6 @@ def texel_of(grids, row, mask, NUM_HEADS: tl.constexpr):
     plane = tile // layer
     down = (tile - plane * layer) // across
     return head, plane, down * 8 + ((row >> 3) & 7), tile % across * 8 + (row & 7), held
-
-
-@triton.jit
-def is_stored(row):
-    """Whether a row found by ``row_of`` is stored."""
-    return row >= 64
 
 
 @triton.jit

@@ -30,6 +30,7 @@ from mmpi_ns.ops.gpu_scene import (
     S_SCALE,
     SHARE,
     STEP,
+    STORED,
     U0,
     U_SCALE,
     V0,
@@ -37,7 +38,6 @@ from mmpi_ns.ops.gpu_scene import (
     WIDTH,
     bilinear,
     cell,
-    is_stored,
     nearest,
     one_minus_exp,
     row_of,
@@ -214,10 +214,10 @@ def pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K: tl.const
         # Whether the tables hold any of the four texels around.
         column, _ = cell(x, tl.load(grids + mpi * INTS + WIDTH))
         row, _ = cell(y, tl.load(grids + mpi * INTS + HEIGHT))
-        held = is_stored(row_of(grids, mpi, plane, row, column, passes))
-        held = held | is_stored(row_of(grids, mpi, plane, row, column + 1, passes))
-        held = held | is_stored(row_of(grids, mpi, plane, row + 1, column, passes))
-        passes = passes & ~(held | is_stored(row_of(grids, mpi, plane, row + 1, column + 1, passes)))
+        held = row_of(grids, mpi, plane, row, column, passes) >= STORED
+        held = held | (row_of(grids, mpi, plane, row, column + 1, passes) >= STORED)
+        held = held | (row_of(grids, mpi, plane, row + 1, column, passes) >= STORED)
+        passes = passes & ~(held | (row_of(grids, mpi, plane, row + 1, column + 1, passes) >= STORED))
         done += passes.to(tl.int32)
         passes = passes & (done < count)
     return done

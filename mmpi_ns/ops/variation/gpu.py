@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, grids_of, is_stored, launch, row_of, texel_of
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, STORED, WIDTH, block_size, grids_of, launch, row_of, texel_of
 from mmpi_ns.ops.layout import SceneLayout, dense
 from mmpi_ns.ops.variation import WithGradient, weigh_chroma
 
@@ -35,7 +35,7 @@ def variation_kernel(
         exists = inside & (nx >= 0) & (nx < tl.load(grid + WIDTH)) & (ny >= 0) & (ny < tl.load(grid + HEIGHT))
         exists = exists & (nz >= 0) & (nz < tl.load(grid + DEPTH))
         row = row_of(grids, head, nz, ny, nx, exists)
-        exists = (exists & is_stored(row))[:, None] & is_channel
+        exists = (exists & (row >= STORED))[:, None] & is_channel
         difference = tl.where(exists, center - tl.load(table + row[:, None] * channels + c[None, :], exists, 0.0), 0.0)
         size, scale = tl.abs(difference), tl.load(scales + 3 * head + axis)[:, None] / 6
         slope += scale * tl.minimum(tl.maximum(difference, -1.0), 1.0)
