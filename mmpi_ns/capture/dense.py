@@ -114,21 +114,14 @@ def measure(view: View, neighbour: View, start: Map, flow: Flow, of_view: tuple[
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
     motion = flow(view.gray, look_up(neighbour.gray, x, y))
-    near = torch.from_numpy(x), torch.from_numpy(y)
-    x, y = np.empty_like(x), np.empty_like(y)
-    for rows in strips(x.shape):
-        moved = follow_motion(*near, torch.from_numpy(motion[rows]), rows.start)
-        x[rows], y[rows] = (values.numpy() for values in moved)
+    at = follow_motion(torch.from_numpy(x), torch.from_numpy(y), torch.from_numpy(motion))
+    x, y = at.x.numpy(), at.y.numpy()
     seen = look_up(np.ascontiguousarray(neighbour.inside, np.uint8), x, y, nearest=True) > 0
     alike = correlation(view.gray, look_up(neighbour.gray, x, y), of_view)
     usable = view.inside & seen & (alike > MIN_CORRELATION) & (of_view[1] > MIN_CONTRAST)
-    inverse, weight = np.empty_like(start), np.empty_like(start)
-    for rows in strips(start.shape):
-        at, correlations = (torch.from_numpy(x[rows]), torch.from_numpy(y[rows])), torch.from_numpy(alike[rows])
-        counted = torch.from_numpy(usable[rows])
-        solved = solve_matches(*at, correlations, counted, *parallax.tensors, rows.start, NOISE**2, MAX_EPIPOLAR**2)
-        inverse[rows], weight[rows] = (values.numpy() for values in solved)
-    return inverse, weight
+    matches = at.x, at.y, torch.from_numpy(alike), torch.from_numpy(usable)
+    inverse, weight = solve_matches(*matches, *parallax.tensors, NOISE**2, MAX_EPIPOLAR**2)
+    return inverse.numpy(), weight.numpy()
 
 
 def mean_and_contrast(image: NDArray[np.uint8]) -> tuple[Map, Map]:
@@ -298,12 +291,10 @@ def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Dep
     """Keeps the depths confirmed by the depth of at least one other image and by at least as many as contradict it."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
     for neighbour, theirs in others:
-        there = torch.from_numpy(theirs.inverse), torch.from_numpy(theirs.error)
+        here, there = ((torch.from_numpy(d.inverse), torch.from_numpy(d.error)) for d in (depth, theirs))
         parallax = Parallax.between(view, neighbour).tensors
-        for rows in strips(depth.inverse.shape):
-            here = torch.from_numpy(depth.inverse[rows]), torch.from_numpy(depth.error[rows])
-            confirms, contradicts = compare_depths(*here, *there, *parallax, rows.start, SAME_DEPTH)
-            confirm[rows] += confirms.numpy()
-            contradict[rows] += contradicts.numpy()
+        confirms, contradicts = compare_depths(*here, *there, *parallax, SAME_DEPTH)
+        confirm += confirms.numpy()
+        contradict += contradicts.numpy()
     kept = (confirm >= 1) & (confirm > contradict)
     return Depth(np.where(kept, depth.inverse, 0), np.where(kept, depth.error, 0))

@@ -162,12 +162,8 @@ class Parallax:
 
     def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
         """Pixels x and y of points at these inverse depths, far outside if behind, and their depths over those here."""
-        maps = np.empty((3, *inverse.shape), np.float32)
-        for rows in strips(inverse.shape):
-            places = place_pixels(torch.from_numpy(inverse[rows]), *self.tensors, rows.start)
-            for part, values in zip(maps, places, strict=True):
-                part[rows] = values.numpy()
-        return maps[0], maps[1], maps[2]
+        x, y, ahead = place_pixels(torch.from_numpy(inverse), *self.tensors)
+        return x.numpy(), y.numpy(), ahead.numpy()
 
 
 def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:

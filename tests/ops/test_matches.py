@@ -9,7 +9,7 @@ import torch
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
 
-ROWS, COLUMNS, FIRST_ROW = 9, 37, 5
+ROWS, COLUMNS = 14, 37
 NOISE, FARTHEST, MOST_RELATIVE = 0.3, 1.0, 0.15
 
 
@@ -31,7 +31,7 @@ def two_cameras(seed):
 
 def place(linear, b, row, column, q):
     """Oracle: where one point appears, and how far ahead. float64"""
-    x, y, ahead = linear @ [column + 0.5, row + FIRST_ROW + 0.5, 1.0] + q * b
+    x, y, ahead = linear @ [column + 0.5, row + 0.5, 1.0] + q * b
     return np.array([x / ahead, y / ahead]), ahead
 
 
@@ -44,7 +44,7 @@ def test_pixels_appear_where_their_points_do(seed):
     linear, b = two_cameras(seed)
     b[2] = -1.0  # the other camera stands ahead, beyond the nearest points
     inverse = np.random.default_rng(seed).uniform(-0.4, 1.6, (ROWS, COLUMNS)).astype(np.float32)
-    places = [p.numpy() for p in place_pixels(*tensors(inverse, linear, b), FIRST_ROW)]
+    places = [p.numpy() for p in place_pixels(*tensors(inverse, linear, b))]
     behind = 0
     for r, c in np.ndindex(inverse.shape):
         at, ahead = place(linear, b, r, c, float(inverse[r, c]))
@@ -58,12 +58,12 @@ def test_pixels_appear_where_their_points_do(seed):
 
 def test_maps_are_read_where_pixels_moved_to():
     rng = np.random.default_rng(0)
-    maps, motion = rng.normal(size=(2, ROWS + FIRST_ROW + 2, COLUMNS)), rng.normal(0, 4, (ROWS, COLUMNS, 2))
+    maps, motion = rng.normal(size=(2, ROWS, COLUMNS)), rng.normal(0, 4, (ROWS, COLUMNS, 2))
     motion[0, :6] = [[0, 0], [1e5, 0], [-1e5, 0], [0, 1e5], [0, -1e5], [COLUMNS - 6, 0]]
     maps, motion = maps.astype(np.float32), motion.astype(np.float32)
-    moved = [part.numpy() for part in follow_motion(*tensors(*maps, motion), FIRST_ROW)]
+    moved = [part.numpy() for part in follow_motion(*tensors(*maps, motion))]
     for r, c in np.ndindex(ROWS, COLUMNS):
-        place = np.array([FIRST_ROW + r, c]) + motion[r, c, ::-1].astype(float)
+        place = np.array([r, c]) + motion[r, c, ::-1].astype(float)
         place = place.clip(0, np.array(maps[0].shape) - 1)
         for image, part in zip(maps.astype(float), moved, strict=True):
             near = [np.maximum(1 - np.abs(np.arange(n) - p), 0) for n, p in zip(image.shape, place, strict=True)]
@@ -83,13 +83,13 @@ def test_matches_tell_the_depth_and_how_certain_it_is(seed):
     for r, c in np.ndindex(shape):
         angle, aside = rng.uniform(0, 2 * np.pi), 0 if exact[r, c] else rng.uniform(0, 1.3)
         at[r, c] = place(linear, b, r, c, q[r, c])[0] + aside * np.array([np.cos(angle), np.sin(angle)])
-        a, (x, y) = linear @ [c + 0.5, r + FIRST_ROW + 0.5, 1.0], at[r, c]
+        a, (x, y) = linear @ [c + 0.5, r + 0.5, 1.0], at[r, c]
         equations = np.array([[b[0] - x * b[2]], [b[1] - y * b[2]]]), np.array([x * a[2] - a[0], y * a[2] - a[1]])
         expected[r, c] = np.linalg.lstsq(*equations, rcond=None)[0][0]
         there, is_ahead[r, c] = place(linear, b, r, c, expected[r, c])
         off[r, c], parallax[r, c] = np.hypot(*(there - at[r, c])), np.hypot(*equations[0]) / is_ahead[r, c]
     maps = tensors(at[..., 0], at[..., 1], alike)
-    solved = solve_matches(*maps, torch.from_numpy(usable), *tensors(linear, b), FIRST_ROW, NOISE**2, FARTHEST**2)
+    solved = solve_matches(*maps, torch.from_numpy(usable), *tensors(linear, b), NOISE**2, FARTHEST**2)
     inverse, certainty = (x.numpy() for x in solved)
     sure = (is_ahead > 0.1) & (parallax > 3) & (np.abs(off - FARTHEST) > 0.01)
     kept = sure & usable & (off < FARTHEST)
@@ -103,12 +103,12 @@ def test_matches_tell_the_depth_and_how_certain_it_is(seed):
 @pytest.mark.parametrize("what", ["no parallax", "not a number", "behind"])
 def test_matches_that_tell_no_depth_have_none(what):
     linear, b = np.eye(3), np.array([0.0 if what == "no parallax" else 10.0, 0.0, 0.0])
-    x, y = np.meshgrid(np.arange(COLUMNS) + 0.5, np.arange(ROWS) + FIRST_ROW + 0.5)
+    x, y = np.meshgrid(np.arange(COLUMNS) + 0.5, np.arange(ROWS) + 0.5)
     alike = np.full(x.shape, np.nan if what == "not a number" else 1.0)
     if what == "behind":
         linear[2, 2] = -1
     maps, usable = tensors(x + 0.5, y, alike), torch.ones(x.shape, dtype=torch.bool)
-    inverse, certainty = solve_matches(*maps, usable, *tensors(linear, b), FIRST_ROW, NOISE**2, FARTHEST**2)
+    inverse, certainty = solve_matches(*maps, usable, *tensors(linear, b), NOISE**2, FARTHEST**2)
     assert certainty.max() < 1e-9 and not inverse.any()
 
 
@@ -122,7 +122,7 @@ def test_depths_are_compared_with_the_nearest_pixel_of_the_other_image(seed):
     theirs, their_error = rng.choice([0, 0.1, 0.2, 0.3], other), rng.uniform(0, 0.02, other)
     depths = tensors(inverse, error, theirs, their_error)
     inverse, error, theirs, their_error = (x.numpy().astype(float) for x in depths)
-    compared = [x.numpy() for x in compare_depths(*depths, *tensors(linear, b), FIRST_ROW, 0.03)]
+    compared = [x.numpy() for x in compare_depths(*depths, *tensors(linear, b), 0.03)]
     counts, unsure = np.zeros(2, int), 0
     for r, c in np.ndindex(shape):
         at, ahead = place(linear, b, r, c, inverse[r, c])

@@ -36,40 +36,37 @@ class Places(NamedTuple):
 class Moved(NamedTuple):
     """Values of two maps where pixels have moved to."""
 
-    x: Float[Tensor, "R W"]
-    y: Float[Tensor, "R W"]
+    x: Float[Tensor, "H W"]
+    y: Float[Tensor, "H W"]
 
 
 class Compared(NamedTuple):
     """What another image's depths say of an image's."""
 
-    confirms: Bool[Tensor, "R W"]
+    confirms: Bool[Tensor, "H W"]
     """It has the same depth there,"""
-    contradicts: Bool[Tensor, "R W"]
+    contradicts: Bool[Tensor, "H W"]
     """or a farther one: it sees through."""
 
 
 class Measured(NamedTuple):
     """Inverse depths with a number that tells how certain they are; both 0 where there is none."""
 
-    inverse: Float[Tensor, "R W"]
-    certainty: Float[Tensor, "R W"]
+    inverse: Float[Tensor, "H W"]
+    certainty: Float[Tensor, "H W"]
     """One over the squared error of a match; the error of a mean."""
 
 
 @operation(in_cpp=0)
-def place_pixels(
-    inverse: Float[Tensor, "H W"], linear: Float[Tensor, "3 3"], b: Float[Tensor, "3"], first_row: int
-) -> Places:
+def place_pixels(inverse: Float[Tensor, "H W"], linear: Float[Tensor, "3 3"], b: Float[Tensor, "3"]) -> Places:
     """Places of pixels in another image.
 
     Args:
-        inverse: inverse depths of some rows of an image.
+        inverse: inverse depths of an image.
         linear: a at a pixel (x, y) is this times (x, y, 1).
         b: change of the homogeneous pixel for each unit of inverse depth.
-        first_row: row of the image with which ``inverse`` begins.
     """
-    x, y, ahead = (a + inverse * shift for a, shift in zip(linear_at(inverse, linear, first_row), b, strict=True))
+    x, y, ahead = (a + inverse * shift for a, shift in zip(linear_at(inverse, linear), b, strict=True))
     behind = ~(ahead > LEAST_AHEAD)
     divisor = torch.where(behind, 1.0, ahead)
     x, y = (torch.where(behind, FAR, c / divisor) for c in (x, y))
@@ -77,43 +74,39 @@ def place_pixels(
 
 
 @operation(in_cpp=0)
-def follow_motion(
-    x: Float[Tensor, "H W"], y: Float[Tensor, "H W"], motion: Float[Tensor, "R W 2"], first_row: int
-) -> Moved:
+def follow_motion(x: Float[Tensor, "H W"], y: Float[Tensor, "H W"], motion: Float[Tensor, "H W 2"]) -> Moved:
     """Values of two maps at the places that pixels have moved to, interpolated; beyond the borders those of the border.
 
     Args:
         x, y: the maps.
-        motion: right and down, pixels, of some rows.
-        first_row: row of the maps with which ``motion`` begins.
+        motion: right and down, pixels.
     """
-    right, down = torch.arange(x.shape[1]), torch.arange(len(motion))[:, None] + first_row
+    right, down = torch.arange(x.shape[1]), torch.arange(len(motion))[:, None]
     return Moved(*between(torch.stack([x, y], -1), right + motion[..., 0], down + motion[..., 1]).unbind(-1))
 
 
 @operation(in_cpp=0)
 def solve_matches(
-    x: Float[Tensor, "R W"],
-    y: Float[Tensor, "R W"],
-    alike: Float[Tensor, "R W"],
-    usable: Bool[Tensor, "R W"],
+    x: Float[Tensor, "H W"],
+    y: Float[Tensor, "H W"],
+    alike: Float[Tensor, "H W"],
+    usable: Bool[Tensor, "H W"],
     linear: Float[Tensor, "3 3"],
     b: Float[Tensor, "3"],
-    first_row: int,
     variance: float,
     farthest_squared: float,
 ) -> Measured:
     """Inverse depths of matches, by least squares: q = -r.s / s.s.
 
     Args:
-        x, y: pixels of another image that match those of some rows of an image.
+        x, y: pixels of another image that match those of an image.
         alike: correlation of the windows about both.
         usable: which matches count.
-        linear, b, first_row: as of ``place_pixels``.
+        linear, b: as of ``place_pixels``.
         variance: of a match where images look alike, square pixels.
         farthest_squared: square of the largest distance from the epipolar line, square pixels.
     """
-    a = linear_at(x, linear, first_row)
+    a = linear_at(x, linear)
     r1, s1 = a[0] - x * a[2], b[0] - x * b[2]
     r2, s2 = a[1] - y * a[2], b[1] - y * b[2]
     squared = (s1 * s1 + s2 * s2).clamp(min=1e-20)
@@ -128,7 +121,7 @@ def solve_matches(
 
 @operation(in_cpp=0)
 def average_matches(
-    inverse: Float[Tensor, "M R W"], certainty: Float[Tensor, "M R W"], most_relative: float
+    inverse: Float[Tensor, "M H W"], certainty: Float[Tensor, "M H W"], most_relative: float
 ) -> Measured:
     """The mean of the largest consistent subset of the M measurements of each pixel, and its error.
 
@@ -161,26 +154,25 @@ def average_matches(
 
 @operation(in_cpp=0)
 def compare_depths(
-    inverse: Float[Tensor, "R W"],
-    error: Float[Tensor, "R W"],
+    inverse: Float[Tensor, "H W"],
+    error: Float[Tensor, "H W"],
     their_inverse: Float[Tensor, "A B"],
     their_error: Float[Tensor, "A B"],
     linear: Float[Tensor, "3 3"],
     b: Float[Tensor, "3"],
-    first_row: int,
     same: float,
 ) -> Compared:
     """Whether another image confirms or contradicts depths, by its nearest pixel where both have one.
 
     Args:
-        inverse: inverse depths of some rows of an image; 0 without one.
+        inverse: inverse depths of an image; 0 without one.
         error: their expected errors.
         their_inverse, their_error: the same of the other image.
-        linear, b, first_row: as of ``place_pixels``.
+        linear, b: as of ``place_pixels``.
         same: relative difference, beside three errors, within which depths agree.
     """
     height, width = their_inverse.shape
-    x, y, ahead = place_pixels.reference(inverse, linear, b, first_row)
+    x, y, ahead = place_pixels.reference(inverse, linear, b)
     column, row = (x - 0.5).round(), (y - 0.5).round()
     both = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (inverse > 0)
     place = torch.where(both, row, 0.0).long() * width + torch.where(both, column, 0.0).long()
@@ -191,8 +183,8 @@ def compare_depths(
     return Compared(both & (apart.abs() < tolerance), both & (apart < -tolerance))
 
 
-def linear_at(image: Tensor, linear: Tensor, first_row: int) -> list[Tensor]:
-    """The three parts of a at pixels of some rows of an image. [H, W] each"""
+def linear_at(image: Tensor, linear: Tensor) -> list[Tensor]:
+    """The three parts of a at the pixels of an image. [H, W] each"""
     x = torch.arange(image.shape[1], dtype=image.dtype) + 0.5
-    y = torch.arange(image.shape[0], dtype=image.dtype)[:, None] + (first_row + 0.5)
+    y = torch.arange(image.shape[0], dtype=image.dtype)[:, None] + 0.5
     return [m[0] * x + (m[1] * y + m[2]) for m in linear]

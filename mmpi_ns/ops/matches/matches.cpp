@@ -24,11 +24,11 @@ struct Linear {
 
 // Rows [begin, end) of pixels at inverse depths: their places, and depths over those here.
 void mmpi_place_pixels(int64_t begin, int64_t end, const float* inverse, const float* linear, const float* b,
-                       int64_t first_row, int64_t, int64_t width, float* x, float* y, float* ahead) {
+                       int64_t, int64_t width, float* x, float* y, float* ahead) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
             const int64_t i = row * width + column, count = width - column;
-            const Linear at(linear, column, first_row + row);
+            const Linear at(linear, column, row);
             const Lanes q = load_some<Lanes>(inverse + i, count), depth = at.a[2] + q * b[2];
             const Mask is_ahead = depth > LEAST_AHEAD;
             const Lanes divisor = pick(is_ahead, depth, splat(1));
@@ -40,11 +40,11 @@ void mmpi_place_pixels(int64_t begin, int64_t end, const float* inverse, const f
 
 // Rows [begin, end) of motions: values of two maps at the places moved to, interpolated, at most at the border.
 void mmpi_follow_motion(int64_t begin, int64_t end, const float* x, const float* y, const float* motion,
-                        int64_t first_row, int64_t height, int64_t width, int64_t, float* moved_x, float* moved_y) {
+                        int64_t height, int64_t width, float* moved_x, float* moved_y) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0, i = row * width; column < width; column++, i++) {
             const float right = std::clamp(column + motion[2 * i], 0.0f, width - 1.0f);
-            const float down = std::clamp(first_row + row + motion[2 * i + 1], 0.0f, height - 1.0f);
+            const float down = std::clamp(row + motion[2 * i + 1], 0.0f, height - 1.0f);
             // Of maps of one row or column, that one.
             const int32_t left = std::max(0, std::min(int32_t(right), int32_t(width - 2)));
             const int32_t top = std::max(0, std::min(int32_t(down), int32_t(height - 2)));
@@ -65,13 +65,12 @@ void mmpi_follow_motion(int64_t begin, int64_t end, const float* x, const float*
 
 // Rows [begin, end) of matches at (x, y): inverse depths and one over their squared errors.
 void mmpi_solve_matches(int64_t begin, int64_t end, const float* x, const float* y, const float* alike,
-                        const bool* usable, const float* linear, const float* b, int64_t first_row,
-                        float variance, float farthest_squared, int64_t, int64_t width, float* inverse,
-                        float* certainty) {
+                        const bool* usable, const float* linear, const float* b, float variance,
+                        float farthest_squared, int64_t, int64_t width, float* inverse, float* certainty) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
             const int64_t i = row * width + column, count = width - column;
-            const Linear at(linear, column, first_row + row);
+            const Linear at(linear, column, row);
             const Lanes u = load_some<Lanes>(x + i, count), v = load_some<Lanes>(y + i, count);
             const Lanes r1 = at.a[0] - u * at.a[2], s1 = b[0] - u * b[2];
             const Lanes r2 = at.a[1] - v * at.a[2], s2 = b[1] - v * b[2];
@@ -92,10 +91,10 @@ void mmpi_solve_matches(int64_t begin, int64_t end, const float* x, const float*
 // Rows [begin, end) of depths: whether those of another image confirm or contradict them.
 void mmpi_compare_depths(int64_t begin, int64_t end, const float* inverse, const float* error,
                          const float* their_inverse, const float* their_error, const float* linear, const float* b,
-                         int64_t first_row, float same, int64_t, int64_t width, int64_t their_height,
-                         int64_t their_width, bool* confirms, bool* contradicts) {
+                         float same, int64_t, int64_t width, int64_t their_height, int64_t their_width,
+                         bool* confirms, bool* contradicts) {
     for (int64_t row = begin; row < end; row++) {
-        const float down = first_row + row + 0.5f;
+        const float down = row + 0.5f;
         for (int64_t column = 0, i = row * width; column < width; column++, i++) {
             confirms[i] = contradicts[i] = false;
             const float q = inverse[i], right = column + 0.5f;

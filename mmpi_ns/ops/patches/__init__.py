@@ -154,7 +154,7 @@ def _correlations(
 ) -> tuple[Tensor, Tensor]:
     """Correlations of patches with one image (-1: none), and whether it shows their middles. [H, W] each"""
     q, right, down = planes.unbind(-1)
-    middle = torch.stack([a + q * s for a, s in zip(linear_at(q, linear, 0), b, strict=True)])
+    middle = torch.stack([a + q * s for a, s in zip(linear_at(q, linear), b, strict=True)])
     to_right, to_down = (
         torch.stack([linear[i, n] + slope * b[i] for i in range(3)]) for n, slope in enumerate((right, down))
     )
