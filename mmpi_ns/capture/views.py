@@ -209,29 +209,26 @@ def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: b
 
     The image [H, W] or [H, W, C] may have any size, and the places any one shape, which the values have, too.
     """
-    at_x, at_y = (np.subtract(c, 0.5, dtype=np.float32) for c in (x, y))
+    # OpenCV counts rows and columns in 16 bits: large images are read in parts, and places are folded into rows.
+    if not x.size or max(image.shape[:2]) > REMAP_SIDE:
+        values = np.zeros((*x.shape, *image.shape[2:]), image.dtype)
+        x, y = x.astype(np.float32), y.astype(np.float32)
+        down, right = (
+            np.clip((c - 0.5) // REMAP_PART, 0, (n - 1) // REMAP_PART).astype(int)
+            for c, n in zip((y, x), image.shape[:2], strict=True)
+        )
+        for row, column in np.unique([down.reshape(-1), right.reshape(-1)], axis=1).T:
+            chosen, top, left = (down == row) & (right == column), REMAP_PART * row, REMAP_PART * column
+            part = image[top : top + REMAP_PART + 1, left : left + REMAP_PART + 1]  # one more, to interpolate with
+            values[chosen] = look_up(part, x[chosen] - left, y[chosen] - top, nearest=nearest)
+        return values
+    at: Any = [np.subtract(c, 0.5, dtype=np.float32) for c in (x, y)]
+    if x.ndim != 2 or max(x.shape) > REMAP_SIDE:
+        width = x.size if x.size <= REMAP_SIDE else REMAP_PART
+        rows = np.zeros((2, -(-x.size // width), width), np.float32)
+        rows.reshape(2, -1)[:, : x.size] = [c.reshape(-1) for c in at]
+        at = rows
     mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
     border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
-    if at_x.ndim <= 2 and at_x.size and max(*image.shape[:2], *at_x.shape) <= REMAP_SIDE:
-        rows = (at_x[None], at_y[None]) if at_x.ndim == 1 else (at_x, at_y)
-        values = cv2.remap(image, *rows, mode, borderMode=border, borderValue=(0.0,))
-        return np.asarray(values).reshape(*at_x.shape, *image.shape[2:])
-    # OpenCV counts rows and columns in 16 bits: places are folded into rows, and large images are read in parts.
-    flat_x, flat_y = at_x.reshape(-1), at_y.reshape(-1)
-    values = np.zeros((len(flat_x), *image.shape[2:]), image.dtype)
-    part = [
-        np.clip(c // REMAP_PART, 0, (n - 1) // REMAP_PART).astype(int)
-        for c, n in ((flat_y, image.shape[0]), (flat_x, image.shape[1]))
-    ]
-    parts = part[0] * (image.shape[1] // REMAP_PART + 1) + part[1]
-    for number in np.unique(parts):
-        inside = np.nonzero(parts == number)[0]
-        top, left = REMAP_PART * part[0][inside[0]], REMAP_PART * part[1][inside[0]]
-        view = image[top : top + REMAP_PART + 1, left : left + REMAP_PART + 1]  # one more, to interpolate with
-        for begin in range(0, len(inside), REMAP_PART**2):
-            chosen = inside[begin : begin + REMAP_PART**2]
-            rows = np.zeros((2, -(-len(chosen) // REMAP_PART), REMAP_PART), np.float32)
-            rows.reshape(2, -1)[:, : len(chosen)] = flat_x[chosen] - left, flat_y[chosen] - top
-            folded = cv2.remap(view, rows[0], rows[1], mode, borderMode=border, borderValue=(0.0,))
-            values[chosen] = folded.reshape(-1, *image.shape[2:])[: len(chosen)]
-    return values.reshape(*x.shape, *image.shape[2:])
+    values = np.asarray(cv2.remap(image, at[0], at[1], mode, borderMode=border, borderValue=(0.0,)))
+    return values.reshape(-1, *image.shape[2:])[: x.size].reshape(*x.shape, *image.shape[2:])

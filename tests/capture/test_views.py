@@ -37,9 +37,8 @@ def test_a_reduced_view_shows_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_parallax_is_that_of_points_in_both_cameras(seed, monkeypatch):
-    """Oracle: the points themselves, in float64; many strips."""
-    monkeypatch.setattr("mmpi_ns.capture.views.STRIP", 100)
+def test_parallax_is_that_of_points_in_both_cameras(seed):
+    """Oracle: the points themselves, in float64."""
     rng = np.random.default_rng(seed)
     shape = (23, 31)
     views = []
