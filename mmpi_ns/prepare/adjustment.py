@@ -5,7 +5,7 @@ metres."""
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,10 @@ PARTS = 20
 """Number of images from which the two halves of a capture are also used separately to judge the focal length."""
 WIDE = 0.08
 """Width of the interval of the focal length, relative to it, from which --focal is asked for."""
+NOTED_OFF, NOTED_WORTH, NOTED_ROUNDS = 0.1, 0.95, 3
+"""Relative difference of a refined focal length from that of EXIF, which is rounded, from which it is asked whether the
+images determine it; share of the reprojection error with that of EXIF to which they must lower it; and adjustments with
+that of EXIF, as it changes all heights."""
 REFINE_ROUNDS, COARSE_PX, FINE_PX = 3, 8.0, 4.0
 """Rounds of refining known poses and triangulating points again; largest reprojection error of a point while these are
 to be refined, and in the end."""
@@ -46,18 +50,6 @@ LEAST_GROUND, GROUND_SHARE, TRIALS = 50, 0.15, 2000
 """Minimum number of points below the cameras for fitting the ground, the fraction that must lie on it, planes tried."""
 GROUND_TILT = 25.0
 """Maximum angle in degrees between gravity estimated from the cameras and the normal of the ground."""
-
-
-@dataclass(frozen=True)
-class Free:
-    """Camera parameters that may be refined."""
-
-    lens: bool
-    """Focal length and distortion."""
-    full_lens: bool
-    """OpenCV's four lens terms in place of one radial term, if they fit clearly better."""
-    principal_point: bool
-    """The principal point, if that fits clearly better. It is hardly observable on straight stretches, but in bends."""
 
 
 def adjust(
@@ -87,15 +79,17 @@ def adjust(
     model.update_point_3d_errors()
 
 
-def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap.Reconstruction:
-    """The model adjusted with more parameters free, if that lowers the error.
+def polish(
+    model: pycolmap.Reconstruction, threads: int, lens: bool, full_lens: bool, principal_point: bool
+) -> pycolmap.Reconstruction:
+    """The model adjusted with more parameters free, if that lowers the error; what may be is as in ``mapping.Task``.
 
     Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point.
     """
     trials = []  # in words, and whether it is the four lens terms; else the principal point
-    if free.principal_point:
+    if principal_point:
         trials.append(("the principal point free", False))
-    if free.full_lens and any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
+    if full_lens and any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
         trials.append(("OpenCV's four lens terms", True))
     if not trials:
         return model
@@ -109,12 +103,12 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
                 f, cx, cy, k = camera.params
                 camera.model = pycolmap.CameraModelId.OPENCV
                 camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
-        adjust(trial, threads, free.lens, center)
+        adjust(trial, threads, lens, center)
         return trial
 
     with progress("Fitting the lens", 1 + len(trials)) as advance:
         light = with_fewer_points(model)
-        adjust(light, threads, free.lens)
+        adjust(light, threads, lens)
         advance()
         for says, is_lens in trials:
             trial = adjusted(light, is_lens, center or not is_lens)
@@ -200,6 +194,44 @@ def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float,
     focals = [float(camera.mean_focal_length()) for camera in firsts]
     low, high = min(focals), max(focals)
     return (high - low) / high, f"between {low:.1f} and {high:.1f} px, {(high - low) / high:.1%} wide"
+
+
+def with_focals(model: pycolmap.Reconstruction, focals: Mapping[int, float], threads: int) -> pycolmap.Reconstruction:
+    """A copy adjusted with given focal lengths, in pixels by camera; those of other cameras stay."""
+    held = copy.deepcopy(model)
+    for number, camera in held.cameras.items():
+        if number in focals:
+            camera.params[camera.focal_length_idxs()] = focals[number]
+    for _ in range(NOTED_ROUNDS):
+        adjust(held, threads, lens=True, focal=False)
+    return held
+
+
+def open_focals(model: pycolmap.Reconstruction, database: Path, threads: int) -> dict[int, float]:
+    """Focal lengths that a database of features has from EXIF, in pixels by camera, if the images hardly determine
+    them, but end elsewhere: with those of EXIF the error is hardly larger. Else empty.
+
+    If all cameras look the same way and move across it, as on a level flight, everything twice as far away through a
+    lens twice as long shows the same."""
+    with pycolmap.Database.open(database) as opened:
+        cameras = [c for c in opened.read_all_cameras() if c.has_prior_focal_length]
+    noted = {c.camera_id: c.mean_focal_length() for c in cameras}
+    apart = [abs(camera.mean_focal_length() / noted[n] - 1) for n, camera in model.cameras.items() if n in noted]
+    if not apart or max(apart) < NOTED_OFF:
+        return {}
+    light = with_fewer_points(model)
+    adjust(light, threads, lens=True)
+    # Root mean squares of the points' errors in pixels, where single points that are lost count little.
+    errors = (
+        np.array([min(point.error, LARGEST_ERROR) for point in m.points3D.values()])
+        for m in (light, with_focals(light, noted, threads))
+    )
+    free, held = (float(np.sqrt((each**2).mean())) for each in errors)
+    is_open = free > NOTED_WORTH * held
+    focals = ", ".join(f"{focal:.0f}" for _, focal in sorted(noted.items())[:3])
+    fate = "kept, as the images hardly determine it" if is_open else "not kept"
+    say(f"Lens: {free:.3f} px, {held:.3f} px with the focal length of EXIF ({focals} px): {fate}.")
+    return noted if is_open else {}
 
 
 def map_known_poses(

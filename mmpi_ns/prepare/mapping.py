@@ -22,10 +22,9 @@ from pathlib import Path
 import pycolmap
 
 from mmpi_ns.capture.sfm import MIN_ANGLE, MIN_INLIERS, SEED, quiet
-from mmpi_ns.prepare.adjustment import STILL, Free, is_bent, polish, quality, with_all_points
+from mmpi_ns.prepare.adjustment import STILL, is_bent, open_focals, polish, quality, with_all_points, with_focals
 from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.features import matching_pairs
-from mmpi_ns.prepare.noted_focal import open_focals, with_focals
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, best_first, judge_alone, judge_together
 from mmpi_ns.utils.errors import InputError, progress, say
 
@@ -64,8 +63,12 @@ class Task:
     """Folder for databases, models and snapshots; holds those of an interrupted run."""
     offered: Sequence[str]
     """Names of all images, in order."""
-    free: Free
-    """What may be refined of the intrinsics."""
+    lens: bool
+    """Whether focal length and distortion may be refined,"""
+    full_lens: bool
+    """OpenCV's four lens terms take the place of one radial term, if they fit clearly better,"""
+    principal_point: bool
+    """and the principal point is refined, likewise: it is hardly observable on straight stretches, but in bends."""
     threads: int
     """CPU threads; below 1 for all."""
     is_sequence: bool
@@ -160,7 +163,7 @@ def _run(
         shutil.rmtree(folder / "models", ignore_errors=True)
         (folder / "models").mkdir(parents=True)
         (folder / "snapshots").mkdir(exist_ok=True)
-        options = mapper_options(attempt, task.free.lens, task.threads, total > MANY)
+        options = mapper_options(attempt, task.lens, task.threads, total > MANY)
         options.snapshot_path, options.snapshot_frames_freq = folder / "snapshots", SNAPSHOT
         before = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
         if before:
@@ -227,7 +230,7 @@ def map_globally(
     start from, in pixels by camera id (the others are those of the database), ``name`` is that of the start, whose
     folder gets the models, and ``names`` are the images to place.
     """
-    folder, folders, refine = task.work / name, task.work / name / "models", task.free.lens
+    folder, folders, refine = task.work / name, task.work / name / "models", task.lens
     if not (folder / "done").exists():
         shutil.rmtree(folder, ignore_errors=True)
         folders.mkdir(parents=True)
@@ -264,14 +267,14 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
     chosen, *others = _candidates(task)
     with progress("Adding points", 1) as advance:
         model = copy.deepcopy(chosen.model)
-        model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
+        model = with_all_points(model, task.database, task.images, task.lens, task.threads)
         advance()
-    noted = open_focals(model, task.database, task.threads) if task.free.lens else {}
+    noted = open_focals(model, task.database, task.threads) if task.lens else {}
     if noted:
         model, *rest = (with_focals(m, noted, task.threads) for m in (model, *(w.model for w in others)))
         others = [witness_of(w.name, w.says, m, task.database, task.offered) for w, m in zip(others, rest, strict=True)]
     else:
-        model = polish(model, task.free, task.threads)
+        model = polish(model, task.threads, task.lens, task.full_lens, task.principal_point)
     polished = witness_of(chosen.name, chosen.says, model, task.database, task.offered)
     before, after = (ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished))
     if after > before:
@@ -296,7 +299,7 @@ def _candidates(task: Task) -> list[Witness]:
             differences = [agreement(right[0], w) for w in right[1:]]
             is_settled = bool(right) and all(d is not None and d.is_same for d in differences)
     focals, is_part, failed = {}, len(task.placed) < len(task.offered), None
-    if candidates and task.free.lens:
+    if candidates and task.lens:
         best = best_first(candidates, task.is_ordered)[0].model
         focals = {n: c.mean_focal_length() for n, c in best.cameras.items()}
     attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
@@ -321,7 +324,7 @@ def _starts(task: Task) -> dict[str, dict[int, float]]:
     multiples of the image side."""
     with pycolmap.Database.open(task.database) as opened:
         unknown = [c for c in opened.read_all_cameras() if not c.has_prior_focal_length]
-    if not task.free.lens or not unknown:
+    if not task.lens or not unknown:
         return {"global": {}}
     guesses = {f"global-{ratio}": {c.camera_id: ratio * max(c.width, c.height) for c in unknown} for ratio in STARTS}
     calibrated_database = task.work / "calibrated.db"

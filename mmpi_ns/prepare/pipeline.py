@@ -22,7 +22,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from mmpi_ns.capture.sfm import load_pycolmap, match_pairs, new_model, quiet, rigid3d
 from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images
-from mmpi_ns.prepare.adjustment import Free, camera_poses, choose_frame, focal_interval, map_known_poses
+from mmpi_ns.prepare.adjustment import camera_poses, choose_frame, focal_interval, map_known_poses
 from mmpi_ns.prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.poses import make_cameras, parse_camera, read_poses
@@ -182,11 +182,10 @@ class Preparation:
             model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
             says = f"{self.known_poses.says}; {says}"
         else:
-            lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
-            free = Free(lens, lens and s.lens == "auto", principal_point=place)
-            is_sequence = self.matching.startswith("sequential")
+            lens, is_sequence = not self.is_fixed, self.matching.startswith("sequential")
+            free = lens, lens and s.lens == "auto", s.camera is None or s.refine_intrinsics
             model, says, verdict = map_and_judge(
-                Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)
+                Task(database, self.image_folder, folder, names, *free, s.threads, is_sequence, self.is_ordered)
             )
             lost = sorted(set(range(1, len(names) + 1)) - set(model.reg_image_ids()))
             connected = DisjointSet(lost)

@@ -14,7 +14,7 @@ from PIL import Image
 
 from mmpi_ns.capture.sfm import count_features
 from mmpi_ns.prepare import adjustment, features, mapping
-from mmpi_ns.prepare.adjustment import Free, camera_poses, similarity_between, with_all_points, with_fewer_points
+from mmpi_ns.prepare.adjustment import camera_poses, similarity_between, with_all_points, with_fewer_points
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.pipeline import WORK, prepare
@@ -36,8 +36,8 @@ def matched(tmp_path_factory):
 @pytest.fixture
 def task(matched, tmp_path):
     names = sorted(p.name for p in (matched / "input/images").iterdir())
-    free = Free(lens=True, full_lens=False, principal_point=False)
-    return Task(matched / "matches/database.db", matched / "input/images", tmp_path, names, free, 1, True, True)
+    free = True, False, False
+    return Task(matched / "matches/database.db", matched / "input/images", tmp_path, names, *free, 1, True, True)
 
 
 def error_of(model):

@@ -16,7 +16,7 @@ from PIL import Image
 
 from mmpi_ns.capture.sfm import rigid3d
 from mmpi_ns.prepare import export, features, mapping
-from mmpi_ns.prepare.adjustment import Free, adjust, choose_frame, is_bent, polish, quality, similarity_between
+from mmpi_ns.prepare.adjustment import adjust, choose_frame, is_bent, polish, quality, similarity_between
 from mmpi_ns.prepare.images import Photo, choose_frames, median_motion
 from mmpi_ns.prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
 from mmpi_ns.utils.errors import InputError
@@ -261,8 +261,8 @@ def test_looser_settings_go_on_from_a_sound_model_of_most_images(first, starts, 
 
     monkeypatch.setattr(mapping, "matching_pairs", lambda path: [(1, 2)] * 500)
     monkeypatch.setattr(mapping, "_run", run)
-    names, free = [f"{i}.jpg" for i in range(100)], Free(lens=True, full_lens=False, principal_point=False)
-    task = mapping.Task(tmp_path / "database", tmp_path, tmp_path, names, free, 1, is_sequence=True, is_ordered=True)
+    names, free = [f"{i}.jpg" for i in range(100)], (True, False, False)
+    task = mapping.Task(tmp_path / "database", tmp_path, tmp_path, names, *free, 1, is_sequence=True, is_ordered=True)
     best, _ = mapping.reconstruct(task, task.database)
     assert seen == starts
     assert best.num_reg_images() == (96 if len(starts) == 1 else 99)
@@ -298,17 +298,17 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
         if track.length() > 2:
             model.add_point3D(point, track, np.zeros(3, np.uint8))
     adjust(model, 1, lens=True)
-    found = polish(model, Free(lens=True, full_lens=True, principal_point=False), 1)
+    found = polish(model, 1, lens=True, full_lens=True, principal_point=False)
     (camera,) = found.cameras.values()
     assert camera.model.name == kept and model.num_points3D() > 150
     assert camera.params[3 if kept == "SIMPLE_RADIAL" else 4] == pytest.approx(0.1, abs=0.05)
     if tangential:
         assert camera.params[6:] == pytest.approx(true[6:], abs=0.004)
-        simple = polish(model, Free(lens=True, full_lens=False, principal_point=False), 1)
+        simple = polish(model, 1, lens=True, full_lens=False, principal_point=False)
         assert [c.model.name for c in simple.cameras.values()] == ["SIMPLE_RADIAL"]
         assert "off square" not in capsys.readouterr().out
         monkeypatch.setattr("mmpi_ns.prepare.adjustment.SQUARE", 1e-4)
-        square = polish(model, Free(lens=True, full_lens=True, principal_point=False), 1)
+        square = polish(model, 1, lens=True, full_lens=True, principal_point=False)
         assert [c.model.name for c in square.cameras.values()] == ["SIMPLE_RADIAL"]
         assert "not kept, as pixels would be" in capsys.readouterr().out
 
