@@ -45,9 +45,7 @@ def positive_number(value: Any) -> float | None:
 def kept_tags(image: Image.Image) -> Image.Exif:
     """The tags of a photo about its body and its shot, for a turned, converted or downscaled copy."""
     source, kept = image.getexif(), Image.Exif()
-    for tag in BODY:
-        if tag in source:
-            kept[tag] = source[tag]
+    kept.update({tag: source[tag] for tag in BODY if tag in source})
     shot = source.get_ifd(ExifTags.IFD.Exif)
     if shot:
         kept[ExifTags.IFD.Exif] = {tag: shot[tag] for tag in SHOT if tag in shot}

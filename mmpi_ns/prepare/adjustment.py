@@ -362,11 +362,10 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
     """
     _, poses = camera_poses(model)
     centers = poses[:, :3, 3]
-    up, words = -poses[:, :3, 1].mean(0), "mean of the cameras, assumed level"
-    up /= max(float(np.linalg.norm(up)), 1e-12)
-    level = level_up(poses[:, :3, 0], up)
-    if level is not None:
-        up, words = level, "perpendicular to the right vectors of the cameras, which are assumed level"
+    up, they_turn = level_up(poses[:, :3, 0], -poses[:, :3, 1])
+    words = "mean of the cameras, assumed level"
+    if they_turn:
+        words = "perpendicular to the right vectors of the cameras, which are assumed level"
     if camera_height is not None:
         points = np.array([p.xyz for p in model.points3D.values()])
         up, height = fit_ground(points, centers, up)
