@@ -350,7 +350,6 @@ def load_observations(
         moving: file for a picture of what moves. None: neither movers nor depths of pixels are searched, which takes
             minutes; tracks or a plane sweep take their place.
     """
-    check_there(data)
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
     if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
