@@ -50,7 +50,6 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import last_checkpoint
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
-from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import TRAINS, ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
@@ -99,10 +98,6 @@ class MMPIModelConfig(ModelConfig):
     """Not an option: the trainer sets it to the name of the method."""
     windows_folder: Path | None = field(default=None, init=False)
     """Not an option: the trainer sets it, and config.yml keeps it for evaluation; where the finished windows lie."""
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads a config.yml, also one from before the options were in groups."""
-        vars(self).update(grouped(state, type(self)()))
 
 
 class MMPIModel(Model):

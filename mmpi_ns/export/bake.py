@@ -26,6 +26,7 @@ from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.metrics import ImageMetrics, psnr
 from mmpi_ns.scene.baked import most_of_copies, neighbours
 from mmpi_ns.scene.windows import window_shares
+from mmpi_ns.training.options import check_nothing_left
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order
 
@@ -37,8 +38,8 @@ MOST_LOOKED_AT = 60e6
 
 
 def read_run_config(path: Path) -> MMPIModelConfig:
-    """The model's settings in a run's config.yml. Raises InputError if ns-train did not write it, or trained another
-    method."""
+    """The model's settings in a run's config.yml. Raises InputError if ns-train did not write it, trained another
+    method, or an earlier version did with an option that left."""
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -47,6 +48,7 @@ def read_run_config(path: Path) -> MMPIModelConfig:
         raise InputError(f"{path} is not a config.yml that ns-train wrote: give the one beside nerfstudio_models.")
     if not isinstance(config.pipeline.model, MMPIModelConfig):
         raise InputError(f"The run of {path} was trained by another method: only those of mmpi can be read.")
+    check_nothing_left(config.pipeline.model)
     return config.pipeline.model
 
 

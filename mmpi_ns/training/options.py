@@ -1,4 +1,4 @@
-"""Options of a run: read from a config.yml of any version, and checked before anything is written."""
+"""Options of a run, checked before anything is written; those of a config.yml, before they are used."""
 
 from __future__ import annotations
 
@@ -81,32 +81,8 @@ NO_EFFECT = {
     "pipeline.model": ("enable_collider", "collider_params", "loss_coefficients", "prompt"),
 }
 """nerfstudio's options that have no effect on this method."""
-RENAMED = {
-    "sampling.threshold": "train_threshold",
-    "rendering.threshold": "render_threshold",
-    "rendering.mode": "render",
-}
-"""Names of the model's options before they were in groups, where the name has changed."""
-LEFT = {"blend_form": "paper", "shared_colour": False, "render_shares": "exact"}
-"""Options that this version may lack, with the value that it stands for."""
 TRAINED = {"growing_rays", "tv_every"}
 """Options that this version lacks and that changed the training alone."""
-
-
-def grouped(state: dict[str, Any], usual: Any) -> dict[str, Any]:
-    """The attributes of a model's config with every option in its group.
-
-    Args:
-        state: attributes as a config.yml has them; those of old versions have no groups.
-        usual: a config with the default groups, which is filled. Options without a group stay where they are.
-    """
-    state = dict(state)
-    for group in {"schedule", "sampling", "colour", "rendering"} - state.keys():
-        for f in fields(getattr(usual, group)):
-            name = RENAMED.get(f"{group}.{f.name}", f.name)
-            if name in state:
-                setattr(getattr(usual, group), f.name, state.pop(name))
-    return vars(usual) | state
 
 
 def check_nothing_left(model: Any) -> None:
@@ -114,12 +90,11 @@ def check_nothing_left(model: Any) -> None:
     groups = {"": model} | {f"{name}.": group for name, group in vars(model).items() if is_dataclass(group)}
     for prefix, group in groups.items():
         for name in vars(group).keys() - {f.name for f in fields(group)} - TRAINED:
-            if name not in LEFT or getattr(group, name) != LEFT[name]:
-                option = f"--pipeline.model.{prefix}{name}".replace("_", "-")
-                raise InputError(
-                    f"The run's config.yml asks for {option} {shown(getattr(group, name))}, which this version lacks: "
-                    "use the version that trained the run, or train anew without it."
-                )
+            option = f"--pipeline.model.{prefix}{name}".replace("_", "-")
+            raise InputError(
+                f"The run's config.yml asks for {option} {shown(getattr(group, name))}, which this version lacks: "
+                "use the version that trained the run, or train anew without it."
+            )
 
 
 def check_rendering() -> None:

@@ -67,11 +67,11 @@ class MMPITrainerConfig(TrainerConfig):
         They take every file in this folder for a checkpoint, so the last one is given explicitly.
         """
         enter_command()
+        check_nothing_left(self.pipeline.model)
         if command() == "ns-render":
             check_rendering()
             manager: Any = self.pipeline.datamanager
             manager.backdrop = BACKGROUNDS[cast(Any, self.pipeline.model).rendering.background]
-        check_nothing_left(self.pipeline.model)
         folder = super().get_checkpoint_dir()
         steps = checkpoints_in(folder)
         if steps and self.load_dir in (None, folder) and self.load_step is None and self.load_checkpoint is None:

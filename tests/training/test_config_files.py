@@ -1,9 +1,8 @@
-"""config.yml files, of this version and of those before the model's options were in groups."""
+"""config.yml files, of this version and of earlier ones."""
 
 from __future__ import annotations
 
 import shutil
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -12,46 +11,31 @@ from nerfstudio.utils.eval_utils import eval_setup
 from training_runs import datamanager, ready, trainer_config
 
 from mmpi_ns.config import mmpi_kitti, mmpi_small
-from mmpi_ns.model import MMPIModelConfig
-from mmpi_ns.training.options import LEFT, TRAINED, check_nothing_left
+from mmpi_ns.training.options import check_nothing_left
 from mmpi_ns.utils.errors import InputError
-
-BEFORE_GROUPS = Path(__file__).with_name("config_before_groups.yml").read_text()
-"""Written by ns-train mmpi-small of commit 94eda72."""
 
 
 def model_of(text):
     return yaml.load(text, Loader=yaml.Loader).pipeline.model
 
 
-def test_a_file_from_before_the_groups_has_every_option_in_its_group():
-    changed = {"hidden_width: 64": "hidden_width: 12", "background: gray": "background: white",
-               "render_threshold: 0.003": "render_threshold: 0.004", "train_threshold: 0.003": "train_threshold: 0.005",
-               "render: auto": "render: exact", "training: joint": "training: two-phase",
-               "decay_from: 0.5": "decay_from: 0.25"}  # fmt: skip
-    text = BEFORE_GROUPS
-    for before, after in changed.items():
-        assert text.count(f"    {before}\n") == 1
-        text = text.replace(f"    {before}\n", f"    {after}\n")
-    model, usual = model_of(text), MMPIModelConfig()
-    assert (model.colour.hidden_width, model.rendering.background, model.rendering.mode) == (12, "white", "exact")
-    assert (model.rendering.threshold, model.sampling.threshold) == (0.004, 0.005)
-    assert (model.schedule.training, model.schedule.decay_from) == ("two-phase", 0.25)
-    assert (model.placement.rays_per_texel, model.loss.depth_outliers) == (2.5, 0.02), "as the file says"
-    assert model.schedule.growth_shares == usual.schedule.growth_shares
-    check_nothing_left(model)
-    unknown = set(vars(model)) - {f.name for f in fields(model)} - set(LEFT) - TRAINED
-    assert not unknown, "every option has found its group"
-
-
 def test_an_option_that_left_and_changes_the_images_is_named():
-    model = model_of(BEFORE_GROUPS.replace("    seed: 0\n    shading", "    seed: 0\n    ghosts: 3\n    shading"))
-    with pytest.raises(InputError, match=r"asks for --pipeline.model.ghosts 3, which this version lacks"):
+    text = yaml.dump(mmpi_small.config)
+    check_nothing_left(model_of(text))
+    # As before options had groups.
+    model = model_of(text.replace("    schedule:", "    train_threshold: 3\n    schedule:"))
+    with pytest.raises(InputError, match=r"asks for --pipeline.model.train-threshold 3, which this version lacks"):
         check_nothing_left(model)
-    model = model_of(BEFORE_GROUPS)
+    model = model_of(text)
     model.rendering.old_way = "x"
     with pytest.raises(InputError, match=r"--pipeline.model.rendering.old-way 'x'"):
         check_nothing_left(model)
+
+
+def test_an_option_that_left_and_changed_the_training_alone_is_passed_over():
+    model = model_of(yaml.dump(mmpi_small.config))
+    model.schedule.growing_rays = model.loss.tv_every = 1
+    check_nothing_left(model)
 
 
 @pytest.mark.parametrize("method", [mmpi_small, mmpi_kitti])
