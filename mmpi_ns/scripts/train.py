@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from datetime import timedelta
 from pathlib import Path
 from typing import NoReturn
 
@@ -23,10 +22,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import train_loop
 from nerfstudio.utils import profiler
 
+from mmpi_ns.training.shared_windows import PATIENCE
 from mmpi_ns.utils.errors import quoted
-
-TIMEOUT = timedelta(days=7)
-"""Time that processes with less work wait for the others; if one dies, torchrun ends the run at once."""
 
 
 def main() -> None:
@@ -34,7 +31,7 @@ def main() -> None:
     if "RANK" not in os.environ:
         sys.exit("Start it as: torchrun --nproc-per-node N -m mmpi_ns.scripts.train mmpi-small --data ...")
     config: TrainerConfig = tyro.cli(AnnotatedBaseConfigUnion)
-    dist.init_process_group("gloo", timeout=TIMEOUT)
+    dist.init_process_group("gloo", timeout=PATIENCE)
     rank, processes = dist.get_rank(), dist.get_world_size()
     try:
         # All processes get the same folder, with one config.yml.

@@ -17,7 +17,8 @@ from mmpi_ns.training.run import Progress
 from mmpi_ns.utils.errors import say
 
 PATIENCE = timedelta(days=7)
-"""nerfstudio's processes time out half an hour after the first of them has finished."""
+"""How long processes with less work wait for the others; nerfstudio's time out after half an hour. If one dies,
+torchrun ends the run at once."""
 WINDOWS_FOLDER = "windows"
 
 
