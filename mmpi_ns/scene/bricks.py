@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate, max_pool2d, pad
 
 from mmpi_ns.scene.plan import FINER
 from mmpi_ns.scene.texels import BRICK, SIDE, TexelGrid, number_tiles
-from mmpi_ns.utils.pages import all_zero, empty_table, forget, lazy_zeros
+from mmpi_ns.utils.pages import FORGET, advise, all_zero, empty_table, lazy_zeros
 
 CHUNK = 1 << 17
 """Texels of an MPI that are resampled at once: for nine channels this takes some 40 MB besides both tables."""
@@ -57,7 +57,7 @@ def move_bricks(table: Shaped[Tensor, "N ..."], kept: Int[Tensor, "K"]) -> Shape
         part = kept[start : start + step]
         torch.index_select(bricks, 0, part, out=moved.view(-1, *bricks.shape[1:])[start : start + step])
         last = int(part[-1]) + 1
-        forget(bricks[passed:last])
+        advise(bricks[passed:last], FORGET)
         passed = last
     return moved
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 FORGET, LARGE_PAGES = 4, 14
-"""Of madvise, in linux/mman.h: MADV_DONTNEED, MADV_HUGEPAGE."""
+"""Of madvise, in linux/mman.h: MADV_DONTNEED gives memory back, and the values are lost; MADV_HUGEPAGE."""
 PART = 1 << 20
 """Numbers that are looked at together."""
 
@@ -30,13 +30,8 @@ def empty_table(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
     """An array that is not written yet, in large pages if the system has any: rows that are read at random then need
     fewer of the processor's page tables."""
     table = torch.empty(shape, dtype=dtype, device=device)
-    _advise(table, LARGE_PAGES)
+    advise(table, LARGE_PAGES)
     return table
-
-
-def forget(array: Tensor) -> None:
-    """Gives back the memory of a contiguous array, or of a part of one, that is not read again; its values are lost."""
-    _advise(array, FORGET)
 
 
 def all_zero(array: Tensor) -> bool:
@@ -45,8 +40,9 @@ def all_zero(array: Tensor) -> bool:
     return not any(bool(part.any()) for part in array.reshape(-1).split(PART))
 
 
-def _advise(array: Tensor, advice: int) -> None:
-    """madvise for the whole pages of a contiguous array on a CPU. What a system does not follow changes nothing."""
+def advise(array: Tensor, advice: int) -> None:
+    """madvise for the whole pages of a contiguous array, or of a part of one, on a CPU. What a system does not follow
+    changes nothing."""
     if array.device.type != "cpu" or sys.platform != "linux":
         return
     start, page = array.data_ptr(), mmap.PAGESIZE

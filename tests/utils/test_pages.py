@@ -10,7 +10,7 @@ import torch
 
 from mmpi_ns.scene.bricks import AT_ONCE, move_bricks
 from mmpi_ns.scene.texels import BRICK
-from mmpi_ns.utils.pages import PART, all_zero, empty_table, forget, lazy_zeros
+from mmpi_ns.utils.pages import FORGET, PART, advise, all_zero, empty_table, lazy_zeros
 
 CPU = torch.device("cpu")
 RESIDENT = """
@@ -18,7 +18,7 @@ import torch
 from pathlib import Path
 from mmpi_ns.scene.bricks import move_bricks
 from mmpi_ns.utils.host import keep_freed_memory
-from mmpi_ns.utils.pages import empty_table, forget, lazy_zeros
+from mmpi_ns.utils.pages import FORGET, advise, empty_table, lazy_zeros
 CPU = torch.device("cpu")
 def mib(name):
     status = Path("/proc/self/status").read_text()
@@ -45,7 +45,7 @@ def test_an_array_of_zeros_is_like_any_other(make, shape, dtype):
 @pytest.mark.parametrize("start, stop", [(0, 1), (1, 5000), (3, 1_000_000), (999, 999), (0, 1_000_000)])
 def test_only_the_part_that_is_forgotten_loses_its_values(start, stop):
     array = torch.arange(1, 1_000_001)
-    forget(array[start:stop])
+    advise(array[start:stop], FORGET)
     assert torch.equal(array[:start], torch.arange(1, start + 1))
     assert torch.equal(array[stop:], torch.arange(stop + 1, 1_000_001))
 
@@ -83,7 +83,7 @@ class TestOnLinux:
         work = """
         table = empty_table((50 << 20,), torch.float32, CPU).fill_(1)
         before = mib("VmRSS")
-        forget(table[: 40 << 20])
+        advise(table[: 40 << 20], FORGET)
         print(before - mib("VmRSS"))
         """
         assert 155 <= numbers_of(work)[0] <= 165
