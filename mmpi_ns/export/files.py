@@ -307,13 +307,10 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, Baked
     intervals, channels = tuple(m["interval"] for m in row["mpis"]), tuple(Codes(**c) for c in row["channels"])
     tables = columns, codes[0], codes[1:].movedim(0, -1).contiguous()
     baked = BakedMpis(plan.mpis, intervals, *tables, Codes(**row["density"]), channels)
-    layers, numbers, start = [], torch.from_numpy(arrays["network"]).float(), 0
-    for outputs, inputs in row["shader"]["layers"]:
-        weights, biases = numbers[start : start + outputs * inputs], numbers[start + outputs * inputs :][:outputs]
-        layers.append((weights.view(outputs, inputs), biases))
-        start += outputs * (inputs + 1)
-    shader = Shader(tuple(layers), row["shader"]["direction_octaves"], row["shader"]["bound"])
-    exposure = tuple(row.get("exposure", (1.0, 1.0, 1.0)))  # before images were shown at one exposure
-    near, far = row["ray_near"], row["farthest"]
-    baked_window = BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure, early.float())
+    shapes = row["shader"]["layers"]
+    parts = torch.from_numpy(arrays["network"]).float().split([n for o, i in shapes for n in (o * i, o)])
+    layers = tuple((weights.view(s), b) for s, weights, b in zip(shapes, parts[::2], parts[1::2], strict=True))
+    shader = Shader(layers, row["shader"]["direction_octaves"], row["shader"]["bound"])
+    numbers = {name: row[name] for name in ("ray_near", "threshold", "background", "farthest")}
+    baked_window = BakedWindow(baked, shader, **numbers, exposure=tuple(row["exposure"]), seen=early.float())
     return (Window(tuple(row["center"]), radius, row["margin"], plan), baked_window), views

@@ -319,7 +319,7 @@ class WindowOnCard {
     gl.uniform1f(this.uniform("threshold"), row.threshold);
     gl.uniform1f(this.uniform("infinity"), 1 / row.farthest);
     gl.uniform1f(this.uniform("background"), row.background);
-    gl.uniform3fv(this.uniform("exposure"), row.exposure || [1, 1, 1]);
+    gl.uniform3fv(this.uniform("exposure"), row.exposure);
     gl.uniform2f(this.uniform("densityCodes"), row.density.low, row.density.step);
     const padded = (name, by) =>
       Array.from({ length: 4 * this.groups }, (_, c) => (c < 3 ? by : 2 * by) * (row.channels[c]?.[name] ?? 0));
