@@ -123,10 +123,9 @@ def window_shares(origins: Float[Tensor, "R 3"], windows: tuple[Window, ...]) ->
     Inside its ball a window has full weight, which falls off linearly over its margin beyond it; weights are
     normalised. A ray that starts in no ball uses the nearest.
     """
-    centers = torch.tensor([w.center for w in windows], dtype=torch.float64, device=origins.device)
-    radii, margins = (
+    centers, radii, margins = (
         torch.tensor([getattr(w, name) for w in windows], dtype=torch.float64, device=origins.device)
-        for name in ("radius", "margin")
+        for name in ("center", "radius", "margin")
     )
     beyond = (origins.double()[:, None] - centers).norm(dim=-1) - radii
     counts = (1 - beyond / margins).clamp(0, 1)

@@ -126,7 +126,6 @@ def check_device(device_type: str) -> None:
 
 def check_run(config: TrainerConfig) -> None:
     """Raises InputError naming the option that cannot be used, or that would be ignored."""
-    manager: Any = config.pipeline.datamanager
     model: Any = config.pipeline.model
     for group, ranges in RANGES.items():
         check_options(attrgetter(group)(config) if group else config, ranges, f"--{group}." if group else "--")
@@ -137,7 +136,7 @@ def check_run(config: TrainerConfig) -> None:
     for name, entry in config.optimizers.items():
         check_number(f"--optimizers.{name}.optimizer.lr", entry["optimizer"].lr, NOT_NEGATIVE)
     for path, names in NO_EFFECT.items():
-        settings = manager if path.endswith("datamanager") else model
+        settings = attrgetter(path)(config)
         usual = type(settings)()
         for name in names:
             if getattr(settings, name) != getattr(usual, name):

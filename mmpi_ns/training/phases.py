@@ -13,9 +13,6 @@ from typing import Literal
 
 from mmpi_ns.utils.errors import InputError
 
-ParameterKind = Literal["density", "features", "colour", "reliability", "camera_opt"]
-Training = Literal["two-phase", "joint"]
-
 SOONER = 4
 """Texels double so many times as early where depths are known, and surfaces need not form."""
 GROWING_SHARE, FULL_STEPS = 0.5, 1250
@@ -29,14 +26,14 @@ TRAINS: dict[str, frozenset[str]] = {
     "blend": frozenset({"reliability"}),
     "finetune": frozenset({"density", "features", "colour", "reliability", "camera_opt"}),
 }
-"""Trainable parameters of each phase; everything else is frozen bit for bit."""
+"""Trainable kinds of parameters of each phase; everything else is frozen bit for bit."""
 
 
 @dataclass
 class ScheduleConfig:
     """What trains when: ``--pipeline.model.schedule.*``."""
 
-    training: Training = "joint"
+    training: Literal["two-phase", "joint"] = "joint"
     """Train each MPI alone, then reliability (two-phase), or all MPIs together without reliability (joint)."""
     rays_per_mpi: Literal["split", "all"] = "all"
     """Individual phase: each MPI renders all rays of a batch (all; K times the work, about that of joint training), or

@@ -133,7 +133,7 @@ class TrainingRun:
     _drawn_from: int | None = None
 
     def parameters(self) -> dict[str, list[Parameter]]:
-        """Parameters by kind (``phases.ParameterKind``); each kind has its own learning rate."""
+        """Parameters by kind (``phases.TRAINS``); each kind has its own learning rate."""
         field = self.field
         groups = {
             "density": [field.density],

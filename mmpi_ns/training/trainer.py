@@ -42,7 +42,7 @@ from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
-from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
+from mmpi_ns.utils.host import command, enter_command, signals_go_to, values_of
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
 
@@ -84,8 +84,7 @@ class MMPITrainerConfig(TrainerConfig):
 
         ns-viewer takes the address from its own options, whose default is every address of the machine.
         """
-        asked = any(word.startswith("--viewer.websocket-host") for word in arguments())
-        if command() == "ns-viewer" and not asked:
+        if command() == "ns-viewer" and not values_of("--viewer.websocket-host"):
             self.viewer.websocket_host = "127.0.0.1"
         return super().get_base_dir()
 
@@ -143,7 +142,7 @@ class MMPITrainer(Trainer):
             # More rays a step on a large GPU, in as many fewer steps, where neither was asked for.
             manager: Any = config.pipeline.datamanager
             method, rays = str(model_config.method), manager.train_num_rays_per_batch
-            asked = any(word.startswith("--pipeline.datamanager.train-num-rays-per-batch") for word in arguments())
+            asked = values_of("--pipeline.datamanager.train-num-rays-per-batch")
             may_change = self._follows_capture and not asked and str(self.device).startswith("cuda")
             if may_change and rays == DEFAULTS[method].rays:
                 processors = torch.cuda.get_device_properties(self.device).multi_processor_count

@@ -53,7 +53,7 @@ def test_a_large_gpu_draws_more_rays_a_step_unless_rays_or_steps_were_asked_for(
     monkeypatch.setattr(torch.cuda, "set_device", lambda _: None)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace(multi_processor_count=132))
     option = "--pipeline.datamanager.train-num-rays-per-batch"
-    monkeypatch.setattr(trainer_module, "arguments", lambda: [option, "1024"] if asked else [])
+    monkeypatch.setattr(trainer_module, "values_of", lambda name: ["1024"] if asked and name == option else [])
     monkeypatch.setattr(Trainer, "setup", lambda *_: (_ for _ in ()).throw(Stop))
     config = copy.deepcopy(mmpi_small.config)
     config.machine.device_type, config.max_num_iterations = device, steps
