@@ -77,9 +77,7 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
     model: MMPIModel = pipeline.model
     cameras: Cameras = pipeline.datamanager.train_dataset.cameras
     places = model.progress.windows.windows
-    shares = (
-        window_shares(cameras.camera_to_worlds[:, :, 3], places) if len(places) > 1 else torch.ones(len(cameras), 1)
-    )
+    shares = window_shares(cameras.camera_to_worlds[:, :, 3], places)
     views, nearest = (), 0
     if (details := model.details) is not None:
         read, nearest = details.view, model.config.rendering.nearest_images

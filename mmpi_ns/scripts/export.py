@@ -109,7 +109,6 @@ class Web(_Run):
         from mmpi_ns.export.web import write_page, write_single_file
 
         if self.single_file:
-            path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=path.parent) as folder:
                 write_baked(scene, Path(folder))
                 write_single_file(Path(folder), path)

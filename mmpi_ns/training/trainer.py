@@ -342,7 +342,7 @@ class MMPITrainer(Trainer):
 
         Names inside the folder are parsed as steps by nerfstudio, so the unfinished file must not lie there.
         """
-        if step < 0 or not (self._share is not None or comms.is_main_process()):
+        if step < 0:
             return  # stopped before the first step: there is nothing to save
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
