@@ -30,7 +30,6 @@ from mmpi_ns.utils.values import shown
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "capture"}
 """Keys of every checkpoint of this method."""
 PLAN_FILE = "plan.json"
-LOCK = ".lock"
 _held: dict[Path, FileLock] = {}
 
 
@@ -71,7 +70,7 @@ def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
         with write_errors(folder, "--output-dir"):
             folder.mkdir(parents=True, exist_ok=True)
             if folder.resolve() not in _held:  # the system releases it when the process ends, however that happens
-                lock = FileLock(folder.resolve() / LOCK)
+                lock = FileLock(folder.resolve() / ".lock")
                 lock.acquire(timeout=0)
                 _held[folder.resolve()] = lock
     except Timeout as error:

@@ -103,7 +103,6 @@ class MMPITrainerConfig(TrainerConfig):
             checkpoint_to_load(self)
         folder = self.get_base_dir()
         claim(folder, self.get_checkpoint_dir(), self.load_checkpoint or self.load_dir)
-        self.pipeline.model.windows_folder = folder / WINDOWS_FOLDER  # type: ignore[attr-defined]
         written = copy.deepcopy(self)
         written.load_dir = written.load_step = written.load_checkpoint = None
         manager: Any = written.pipeline.datamanager
@@ -136,7 +135,7 @@ class MMPITrainer(Trainer):
             config = self.config
             model_config: Any = config.pipeline.model
             model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
-            self._window_steps = model_config.total_steps = config.max_num_iterations
+            model_config.total_steps = config.max_num_iterations
             model_config.method, self._follows_capture = config.method_name, config.max_num_iterations == 0
             model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
             # More rays a step on a large GPU, in as many fewer steps, where neither was asked for.
