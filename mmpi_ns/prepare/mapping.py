@@ -64,11 +64,12 @@ class Task:
     offered: Sequence[str]
     """Names of all images, in order."""
     lens: bool
-    """Whether focal length and distortion may be refined,"""
+    """Whether focal length and distortion may be refined."""
     full_lens: bool
-    """OpenCV's four lens terms take the place of one radial term, if they fit clearly better,"""
+    """Whether OpenCV's four lens terms may take the place of one radial term, if they fit clearly better."""
     principal_point: bool
-    """and the principal point is refined, likewise: it is hardly observable on straight stretches, but in bends."""
+    """Whether the principal point may be refined, if that fits clearly better: bends show it, straight stretches
+    hardly do."""
     threads: int
     """CPU threads; below 1 for all."""
     is_sequence: bool
