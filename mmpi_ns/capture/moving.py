@@ -9,7 +9,7 @@ with each other, and the images between them only where something moves near the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,9 +23,9 @@ from rich.progress import track
 from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Progress, find_depths
-from mmpi_ns.capture.moving_carry import carried
+from mmpi_ns.capture.moving_carry import Carried, carried
 from mmpi_ns.capture.moving_doubt import doubt_of
-from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
+from mmpi_ns.capture.moving_evidence import Evidence, Mask, Neighbour, Shot, evidence, ground_of
 from mmpi_ns.capture.moving_follow import upright_objects
 from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
 from mmpi_ns.capture.moving_sweep import Sweep, sweep
@@ -64,7 +64,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 15
+VERSION = 16
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -101,27 +101,27 @@ def find_moving(
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
     nothing, first = masks.copy(), {}
 
-    def look(i: int) -> tuple[Mask, _First]:
+    def look(i: int) -> tuple[Mask, _Look]:
         shots[i] = replace(shots[i], people=people_in(images, i, shots[i].view, up))
         return _moves(shots, near[i], i, nothing, nothing[i], None)
 
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
         part = key_images(images, points_of, FIRST)
         while part:
-            for i, (mask, knowledge) in zip(part, pool.map(look, part), strict=True):
-                masks[i], first[i] = mask, knowledge
+            for i, (mask, seen) in zip(part, pool.map(look, part), strict=True):
+                masks[i], first[i] = mask, seen
             part = [i for i in range(len(shots)) if i not in first and any(masks[j].any() for j in near[i])]
         uprights = upright_objects(shots, near, masks, pool)
         masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
         again = [i for i in first if any(masks[j].any() for j in near[i])]
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i]), again))
-        seen = masks.copy()
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
-        masks = _followed_aside(shots, near, masks, seen, {i: first[i] for i in again}, pool)
+        looks = {i: look for i, (_, look) in zip(again, second, strict=True)}
+        masks = _followed_on(shots, near, masks, looks, pool)
     # Whatever moves comes close at some time; what is found where nothing moves is mostly small. Walkers may stay away.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
-        walkers = {i: knowledge.walkers for i, knowledge in first.items() if knowledge.walkers.any()}
+        walkers = {i: seen.walkers for i, seen in first.items() if seen.walkers.any()}
         masks = [walkers[i] if i in walkers and len(walkers) >= WALKERS else nothing[i] for i in range(len(masks))]
     return [shot.view for shot in shots], masks, doubt_of(shots, up, masks)
 
@@ -266,8 +266,8 @@ def gain_of(shot: Shot, other: Shot) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class _First:
-    """What the first pass says of an image whatever moves in others."""
+class _Look:
+    """What an image shows."""
 
     gains: list[NDArray[np.float64]]
     """Of its neighbours. [3] each"""
@@ -276,62 +276,75 @@ class _First:
     """Of ``seeds``. [h, w]"""
     walkers: Mask
     """People alone. [h, w]"""
+    shown: Evidence
+    core: Mask
+    """What moves for certain, of which objects grow. [h, w]"""
 
 
 def _moves(
-    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], uprights: Mask, first: _First | None
-) -> tuple[Mask, _First]:
-    """What moves in an image, where it is known what moves in others and where it shows people of theirs."""
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], uprights: Mask, first: _Look | None
+) -> tuple[Mask, _Look]:
+    """What an image itself shows to move, if it is known what moves in others and where it shows people of theirs."""
     shot = shots[i]
     gains = first.gains if first else [gain_of(shot, shots[j]) for j in near]
     others = [Neighbour.of(shot, shots[j], gain) for j, gain in zip(near, gains, strict=True)]
-    is_first = first is None
-    if first is None:
-        nobody = np.zeros(shot.view.gray.shape, bool)
-        first = _First(gains, sweep(shot, others), np.full(nobody.shape, UNASKED, np.int16), nobody)
-    shown = evidence(shot, others, [masks[j] for j in near], first.swept.impossible)
-    if is_first and len(shot.people):
-        first = replace(first, walkers=grown(shot, shown, first.walkers))
-    static = is_static(shot, shown)
-    core = first.swept.certain & ~static
+    swept = first.swept if first else sweep(shot, others)
+    levels = first.levels if first else np.full(uprights.shape, UNASKED, np.int16)
+    shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
+    walkers = first.walkers if first else np.zeros_like(uprights)
+    if first is None and len(shot.people):
+        walkers = grown(shot, shown, walkers)
+    core = uprights | (swept.certain & ~is_static(shot, shown))
     if len(others) >= 2:
-        core |= seeds(shot, others, shown, first.levels)
-        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-        flow.setVariationalRefinementIterations(0)
-        for j in near[:AFTER]:
-            if masks[j].any():
-                core |= followed(shot, shots[j], masks[j], flow) & ~static
-        carry = carried(shot, others, [masks[j] for j in near], masks[i])
-        core |= (carry.pixels | carry.objects) & ~static
-    return grown(shot, shown, core | uprights), first
+        core |= seeds(shot, others, shown, levels)
+    return grown(shot, shown, core), _Look(gains, swept, levels, walkers, shown, core)
 
 
-def _followed_aside(
+def _followed_on(
     shots: Sequence[Shot],
     near: Sequence[Sequence[int]],
     masks: list[Mask],
-    before: list[Mask],
-    first: Mapping[int, _First],
+    looks: dict[int, _Look],
     pool: ThreadPoolExecutor,
 ) -> list[Mask]:
-    """Masks [h, w] with objects that enter or leave images at the side, next to images in which such are masked now and
-    were not ``before``; of the images that ``first`` knows."""
+    """Masks [h, w] with what is followed from them to the images that were looked at again: by optical flow, along the
+    path, and on from image to image where objects enter or leave images at the side."""
+
+    def followed_to(part: Iterable[int], some_of: Callable[[int], Mask]) -> list[Mask]:
+        def whole(i: int) -> Mask:
+            shot, look = shots[i], looks[i]
+            some = some_of(i) & ~is_static(shot, look.shown)
+            if not (some & ~masks[i]).any():
+                return masks[i]
+            looks[i] = replace(look, core=look.core | some)
+            return masks[i] | grown(shot, look.shown, looks[i].core)
+
+        arrived = dict(zip(part, pool.map(whole, part), strict=True))
+        return [arrived.get(i, mask) for i, mask in enumerate(masks)]
+
+    def by_flow(i: int) -> Mask:
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        flow.setVariationalRefinementIterations(0)
+        result = np.zeros_like(masks[i])
+        for j in near[i][:AFTER]:
+            if masks[j].any():
+                result |= followed(shots[i], shots[j], masks[j], flow)
+        return result
+
+    def along_path(i: int) -> Carried:
+        gains = looks[i].gains
+        others = [Neighbour.of(shots[i], shots[j], gain) for j, gain in zip(near[i], gains, strict=True)]
+        return carried(shots[i], others, [masks[j] for j in near[i]], masks[i])
+
+    def all_along_path(i: int) -> Mask:
+        carry = along_path(i)
+        return carry.pixels | carry.objects
+
+    before = masks
+    masks = followed_to(looks, by_flow)
+    masks = followed_to(looks, all_along_path)
     for _ in range(FURTHER):
         aside = [reaches_side(mask & ~old) for mask, old in zip(masks, before, strict=True)]
-        part, before = [i for i in first if any(aside[j] for j in near[i][:AFTER])], masks
-        arrived = pool.map(lambda i: _arrived(shots, near[i], i, before, first[i]), part)  # noqa: B023
-        masks = list(before)
-        for i, mask in zip(part, arrived, strict=True):
-            masks[i] = masks[i] | mask
+        part, before = [i for i in looks if any(aside[j] for j in near[i][:AFTER])], masks
+        masks = followed_to(part, lambda i: along_path(i).objects)
     return masks
-
-
-def _arrived(shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], first: _First) -> Mask:
-    """Whole objects of its neighbours that an image shows unmasked; arguments as for ``_moves``. [h, w]"""
-    shot, moving = shots[i], [masks[j] for j in near]
-    others = [Neighbour.of(shot, shots[j], gain) for j, gain in zip(near, first.gains, strict=True)]
-    core = carried(shot, others, moving, masks[i]).objects
-    if not core.any():
-        return core
-    shown = evidence(shot, others, moving, first.swept.impossible)
-    return grown(shot, shown, core & ~is_static(shot, shown))

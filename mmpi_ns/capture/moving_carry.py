@@ -38,7 +38,7 @@ COHERENT = 1.1
 SCATTERED, CLOSED, LEAST_PIXELS = 3.0, 13, 450
 """The same within a whole object, pixels across which what moves there is one, and those of an object, at half the
 size."""
-NEW, UP = 0.3, 0.2
+NEW, UP = 0.5, 0.2
 """Share of an object that is masked already, at most, for it to be another one; and how far below the horizon its
 highest pixel lies, over its lowest, at most: what moves by the camera is nearly as high as it."""
 

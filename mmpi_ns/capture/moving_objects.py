@@ -63,8 +63,9 @@ STANDS = 0.1
 chimneys and towers in front of the sky look like movers where few images show them from far apart."""
 ITERATIONS, LARGE = 3, 4000
 """Of GrabCut, and pixels from which on it is done at half the size."""
-FOLLOWED = 0.7
-"""Correlation with the neighbour from which an object is followed."""
+FOLLOWED, INNER = 0.7, 3
+"""Correlation with the neighbour from which an object is followed, and pixels across which it is shrunk there: its
+outline is uncertain."""
 
 
 def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence, levels: NDArray[np.int16]) -> Mask:
@@ -213,7 +214,8 @@ def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> M
     """
     gray = shot.view.gray
     x, y, ahead = Warp.between(shot.view, other.view).places(np.zeros(gray.shape, np.float32))
-    moves = cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST) * (ahead > 0)
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((INNER, INNER), np.uint8))
+    moves = cv2.remap(inner, x, y, cv2.INTER_NEAREST) * (ahead > 0)
     turned = np.asarray(cv2.remap(other.view.gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     there = np.asarray(flow.calc(gray, turned, None))  # type: ignore[call-overload]
     back = np.asarray(flow.calc(turned, gray, None))  # type: ignore[call-overload]
