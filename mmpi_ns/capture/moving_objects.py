@@ -47,7 +47,7 @@ TALL = 1.15
 NARROW, UPRIGHT, LOW = 0.4, 1.05, 0.8
 """Width over the height of the camera below which an object is a person, as tall as the second, with a head of other
 colours than its body; others are filled up to the third."""
-CORE = 0.15
+CORE = 0.1
 """Share of an object that seeds cover, at least, and half of it where neighbours say nothing: else it is a strip that
 fell out of what stands."""
 UNSEEN, GAP, LOWEST = 0.5, 3, 0.24

@@ -14,7 +14,7 @@ import pytest
 from mmpi_ns.capture import moving
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving import reaches_side
-from mmpi_ns.capture.moving_carry import carried, whole_objects
+from mmpi_ns.capture.moving_carry import Carried, carried, whole_objects
 from mmpi_ns.capture.moving_evidence import Neighbour, Shot
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View
@@ -102,7 +102,8 @@ def test_a_car_without_texture_is_taken_as_a_whole():
     nothing = np.zeros_like(car)
     whole = whole_objects(scattered & (car | curb), horizon_at_30, nothing)
     assert whole[car].mean() > 0.9 and not whole[curb].any()
-    assert not whole_objects(scattered & car, horizon_at_30, car).any()  # masked already
+    assert not whole_objects(scattered & car, horizon_at_30, car & (np.arange(120) < 17)).any()  # mostly masked already
+    assert whole_objects(scattered & car, horizon_at_30, car & (np.arange(120) < 12))[car].mean() > 0.9
     assert not whole_objects(scattered & car & (np.arange(120) < 6), horizon_at_30, nothing).any()  # too small
 
 
@@ -112,31 +113,80 @@ def test_images_next_to_what_is_newly_masked_at_a_side_are_looked_at_again():
     assert reaches_side(side) and reaches_side(side[:, ::-1]) and not reaches_side(middle) and not reaches_side(strip)
 
 
-def test_an_object_at_the_side_is_followed_on_from_image_to_image_twice(monkeypatch):
-    """Five images in a row, of which the second pass masks the first one's side and another one's middle."""
-    view = View(np.zeros((20, 50), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((20, 50), bool))
-    shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), Depth(*np.zeros((2, 20, 50), np.float32)), None)] * 5
+def five_in_a_row(monkeypatch, second: list[np.ndarray], first: np.ndarray, **parts) -> list[np.ndarray]:
+    """Masks of five images whose first look masks ``first``, and whose second look masks ``second``."""
+    shape = first.shape
+    view = View(np.zeros(shape, np.uint8), np.ones(4), np.eye(4)[:3], np.ones(shape, bool))
+    shots = [Shot(view, np.zeros((*shape, 3), np.uint8), Depth(*np.zeros((2, *shape), np.float32)), None)] * 5
     poses = np.tile(np.eye(4)[:3], (5, 1, 1))
-    poses[:, 0, 3] = 0, 2, 3, 5, 8
-    images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile([50.0, 20], (5, 1)), np.zeros((5, 4)))
-    side, middle, speck = np.zeros((3, 20, 50), bool)
-    side[:, :4], middle[:, 20:30], speck[0, 20] = True, True, True
+    images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile(shape[::-1], (5, 1)), np.zeros((5, 4)))
+
+    def moves(shots, near, i, masks, uprights, look):
+        mask = first if look is None else second[i]
+        return mask, moving._Look([1.0] * len(near), None, None, np.zeros_like(mask), SimpleNamespace(image=i), mask)
+
+    replaced = {
+        "find_depths": lambda *_: iter(shots), "people_in": lambda *_: np.zeros((0, 4), int), "_moves": moves,
+        "neighbours": lambda images, i, keys: [j for j in (i - 1, i + 1) if 0 <= j < 5],
+        "num_threads": lambda: 1,
+        "is_static": lambda shot, shown: np.zeros(shape, bool), "grown": lambda shot, shown, core: core,
+        "carried": lambda *_: Carried(*np.zeros((2, *shape), bool)), **parts,
+    }  # fmt: skip
+    for name, value in replaced.items():
+        monkeypatch.setattr(moving, name, value)
+    return moving.find_moving(images, lambda i: np.zeros((0, 3)))[1]
+
+
+def test_an_object_at_the_side_is_followed_on_from_image_to_image_twice(monkeypatch):
+    """Of five images in a row, the second look masks the first one's middle and the last one's; objects are followed
+    to images whose neighbours have one at the side, not from the middle."""
+    middle, speck, side = np.zeros((3, 20, 50), bool)
+    middle[:, 20:30], speck[0, 20], side[:, :4] = True, True, True
     asked = []
 
-    def moves(shots, near, i, masks, uprights, first):
-        return speck if first is None else (side | speck, speck, speck, speck, middle)[i], SimpleNamespace(
-            walkers=speck
-        )
+    def carry(shot, others, masks, mask):
+        asked.append(1)
+        arrived = side if len(asked) == 1 or len(asked) > 5 else np.zeros_like(side)
+        return Carried(np.zeros_like(side), arrived)
 
-    def arrived(shots, near, i, masks, first):
-        asked.append(i)
-        return side
-
-    for name, value in (
-        ("find_depths", lambda *_: iter(shots)), ("people_in", lambda *_: np.zeros((0, 4), int)), ("_moves", moves),
-        ("_arrived", arrived), ("neighbours", lambda images, i, keys: [j for j in (i - 1, i + 1) if 0 <= j < 5]),
-    ):  # fmt: skip
-        monkeypatch.setattr(moving, name, value)
-    _, masks, _ = moving.find_moving(images, lambda i: np.zeros((0, 3)))
+    masks = five_in_a_row(monkeypatch, [middle, speck, speck, speck, middle], speck, carried=carry)
+    # All five along the path, of which the first has the object; then its neighbour, then that one's neighbours.
     assert [bool(mask[:, 0].all()) for mask in masks] == [True, True, True, False, False]
-    assert sorted(asked) == [0, 1, 2] and masks[2][0, 20] and masks[4][0, 25]
+    assert len(asked) == 5 + 1 + 2 and masks[2][0, 20] and masks[4][0, 25]
+
+
+def test_only_what_a_second_look_shows_by_itself_is_followed_by_flow_and_then_along_the_path(monkeypatch):
+    mistake, car, by_flow = np.zeros((3, 20, 50), bool)
+    mistake[:, :10], car[:, 20:30], by_flow[:, 30:34] = True, True, True
+    sources = []
+
+    def followed(shot, other, mask, flow):
+        sources.append(mask)
+        return by_flow
+
+    def carry(shot, others, masks, mask):
+        sources.extend(masks)
+        assert mask[:, 20:34].all()
+        return Carried(*np.zeros((2, 20, 50), bool))
+
+    masks = five_in_a_row(monkeypatch, [car] * 5, mistake | car, followed=followed, carried=carry)
+    assert sources and not any((source & mistake).any() for source in sources)
+    assert all((mask == car | by_flow).all() for mask in masks)
+
+
+def test_an_object_regrows_with_all_its_seeds_and_loses_nothing(monkeypatch):
+    """One is an object for its seeds of all kinds together only; what does not regrow stays masked."""
+    seed, by_flow, pixels, large = np.zeros((4, 20, 50), bool)
+    seed[:, 20:22], by_flow[:, 22:24], pixels[:, 24:26], large[:, 20:30] = True, True, True, True
+    cores = []
+
+    def grown(shot, shown, core):
+        cores.append(core)
+        return large if core[0, 20:26].all() else np.zeros_like(core)
+
+    masks = five_in_a_row(
+        monkeypatch, [seed] * 5, seed, grown=grown, followed=lambda *_: by_flow,
+        carried=lambda *_: Carried(pixels, np.zeros_like(seed)),
+    )  # fmt: skip
+    assert len(cores) == 10 and all((mask == large).all() for mask in masks)
+    assert not cores[0][0, 24] and cores[0][0, 20:24].all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -78,6 +79,7 @@ def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_i
 
     monkeypatch.setattr(moving, "find_depths", lambda *_: iter(shots))
     monkeypatch.setattr(moving, "_moves", moves)
+    monkeypatch.setattr(moving, "_followed_on", lambda shots, near, masks, *_: masks)
     monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
     poses = np.tile(np.eye(4)[:3], (5, 1, 1))
     poses[:, 0, 3] = range(5)
@@ -105,8 +107,11 @@ def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed
     shot = Shot(
         View(np.zeros((1, 12), np.uint8), np.ones(4), np.eye(4)[:3], static), np.zeros((1, 12, 3)), nothing, None
     )
-    core, _ = moving._moves([shot] * 3, [1, 2], 0, masks, person, None)
-    assert core[0].tolist() == [*[False, True] * 2, *[True] * 4, *[False, True] * 2]
+    mask, look = moving._moves([shot] * 3, [1, 2], 0, masks, person, None)
+    assert mask[0].tolist() == [False, True, *[False] * 2, *[True] * 4, *[False] * 4]
+    with ThreadPoolExecutor(1) as pool:
+        mask = moving._followed_on([shot] * 3, [[1, 2]] * 3, [mask, *masks[1:]], {0: look}, pool)[0]
+    assert mask[0].tolist() == [*[False, True] * 2, *[True] * 4, *[False, True] * 2]
 
 
 def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):
