@@ -23,6 +23,7 @@ from mmpi_ns.capture.moving_evidence import (
     Warp,
     all_where,
     most_of_channels,
+    turned,
     two_least,
 )
 from mmpi_ns.capture.views import look_up, pixel_grid
@@ -214,13 +215,15 @@ def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> M
     """
     gray = shot.view.gray
     x, y, ahead = Warp.between(shot.view, other.view).places(np.zeros(gray.shape, np.float32))
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((INNER, INNER), np.uint8))
+    inner = mask.astype(np.uint8)
+    if not turned(shot.view, other.view):
+        inner = cv2.erode(inner, np.ones((INNER, INNER), np.uint8))
     moves = cv2.remap(inner, x, y, cv2.INTER_NEAREST) * (ahead > 0)
-    turned = np.asarray(cv2.remap(other.view.gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-    there = np.asarray(flow.calc(gray, turned, None))  # type: ignore[call-overload]
-    back = np.asarray(flow.calc(turned, gray, None))  # type: ignore[call-overload]
+    seen = np.asarray(cv2.remap(other.view.gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    there = np.asarray(flow.calc(gray, seen, None))  # type: ignore[call-overload]
+    back = np.asarray(flow.calc(seen, gray, None))  # type: ignore[call-overload]
     x, y = pixel_grid(gray.shape)
     at = x + there[..., 0], y + there[..., 1]
     returned = np.abs(there + look_up(back, *at)).max(-1) < 1.5
-    alike = correlation(gray, look_up(turned, *at), mean_and_contrast(gray))
+    alike = correlation(gray, look_up(seen, *at), mean_and_contrast(gray))
     return returned & (alike > FOLLOWED) & (look_up(moves, *at, nearest=True) > 0)

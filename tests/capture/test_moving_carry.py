@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -120,10 +120,11 @@ def five_in_a_row(monkeypatch, second: list[np.ndarray], first: np.ndarray, **pa
     shots = [Shot(view, np.zeros((*shape, 3), np.uint8), Depth(*np.zeros((2, *shape), np.float32)), None)] * 5
     poses = np.tile(np.eye(4)[:3], (5, 1, 1))
     images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile(shape[::-1], (5, 1)), np.zeros((5, 4)))
+    unused: Any = None
 
     def moves(shots, near, i, masks, uprights, look):
         mask = first if look is None else second[i]
-        return mask, moving._Look([1.0] * len(near), None, None, np.zeros_like(mask), SimpleNamespace(image=i), mask)
+        return mask, moving._Look([np.ones(3)] * len(near), unused, unused, np.zeros_like(mask), unused, mask)
 
     replaced = {
         "find_depths": lambda *_: iter(shots), "people_in": lambda *_: np.zeros((0, 4), int), "_moves": moves,
