@@ -2,8 +2,9 @@
 
 Every image is compared with its neighbours at reduced size (``moving_evidence.py``), also at depths that only something
 that moves can seem to have (``moving_sweep.py``); what is left over grows to objects (``moving_objects.py``). A second
-pass looks again near images in which something moves, without what moves in them. Of a video, key images are compared
-with each other, and the images between them only where something moves near them.
+look near images in which something moves does without what moves in them, and only what it shows by itself is followed
+to other images. Of a video, key images are compared with each other, and the images between them only where something
+moves near them.
 """
 
 from __future__ import annotations

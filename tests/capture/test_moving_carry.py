@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.capture import moving
+from mmpi_ns.capture import moving, moving_objects
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving import reaches_side
 from mmpi_ns.capture.moving_carry import Carried, carried, whole_objects
 from mmpi_ns.capture.moving_evidence import Neighbour, Shot
+from mmpi_ns.capture.moving_objects import followed
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View
 
@@ -191,3 +192,14 @@ def test_an_object_regrows_with_all_its_seeds_and_loses_nothing(monkeypatch):
     )  # fmt: skip
     assert len(cores) == 10 and all((mask == large).all() for mask in masks)
     assert not cores[0][0, 24] and cores[0][0, 20:24].all()
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_what_is_followed_by_flow_is_a_pixel_inside_of_its_mask_unless_the_camera_turns(monkeypatch, turns):
+    monkeypatch.setattr(moving_objects, "turned", lambda *_: turns)
+    shot, _ = an_image(0.0, [])
+    mask, inner = np.zeros((2, *SIZE), bool)
+    mask[90:130, 60:110], inner[91:129, 61:109] = True, True
+    seen = followed(shot, shot, mask, cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST))
+    assert seen[inner].mean() > 0.9 and not seen[~mask].any()
+    assert seen[mask & ~inner].mean() > 0.9 if turns else not seen[mask & ~inner].any()
