@@ -186,9 +186,13 @@ def test_an_object_regrows_with_all_its_seeds_and_loses_nothing(monkeypatch):
         cores.append(core)
         return large if core[0, 20:26].all() else np.zeros_like(core)
 
+    def carry(shot, others, masks, mask):
+        assert (mask >= seed).all()  # it did not regrow from what flow added
+        return Carried(pixels, np.zeros_like(seed))
+
     masks = five_in_a_row(
         monkeypatch, [seed] * 5, seed, grown=grown, followed=lambda *_: by_flow,
-        carried=lambda *_: Carried(pixels, np.zeros_like(seed)),
+        carried=carry,
     )  # fmt: skip
     assert len(cores) == 10 and all((mask == large).all() for mask in masks)
     assert not cores[0][0, 24] and cores[0][0, 20:24].all()
