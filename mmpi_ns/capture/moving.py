@@ -65,7 +65,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 16
+VERSION = 17
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -342,8 +342,7 @@ def _followed_on(
         return carry.pixels | carry.objects
 
     before = masks
-    masks = followed_to(looks, by_flow)
-    masks = followed_to(looks, all_along_path)
+    masks = followed_to(looks, lambda i: by_flow(i) | all_along_path(i))
     for _ in range(FURTHER):
         aside = [reaches_side(mask & ~old) for mask, old in zip(masks, before, strict=True)]
         part, before = [i for i in looks if any(aside[j] for j in near[i][:AFTER])], masks
