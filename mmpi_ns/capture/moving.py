@@ -308,8 +308,8 @@ def _followed_on(
     looks: dict[int, _Look],
     pool: ThreadPoolExecutor,
 ) -> list[Mask]:
-    """Masks [h, w] with what is followed from them to the images that were looked at again: by optical flow, along the
-    path, and on from image to image where objects enter or leave images at the side."""
+    """Masks [h, w] with what is followed from them to the images that were looked at again: by optical flow and along
+    the path, and on along it from image to image where objects enter or leave images at the side."""
 
     def followed_to(part: Iterable[int], some_of: Callable[[int], Mask]) -> list[Mask]:
         def whole(i: int) -> Mask:
@@ -337,12 +337,11 @@ def _followed_on(
         others = [Neighbour.of(shots[i], shots[j], gain) for j, gain in zip(near[i], gains, strict=True)]
         return carried(shots[i], others, [masks[j] for j in near[i]], masks[i])
 
-    def all_along_path(i: int) -> Mask:
+    def everywhere(i: int) -> Mask:
         carry = along_path(i)
-        return carry.pixels | carry.objects
+        return by_flow(i) | carry.pixels | carry.objects
 
-    before = masks
-    masks = followed_to(looks, lambda i: by_flow(i) | all_along_path(i))
+    before, masks = masks, followed_to(looks, everywhere)
     for _ in range(FURTHER):
         aside = [reaches_side(mask & ~old) for mask, old in zip(masks, before, strict=True)]
         part, before = [i for i in looks if any(aside[j] for j in near[i][:AFTER])], masks

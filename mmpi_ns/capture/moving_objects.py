@@ -65,8 +65,8 @@ chimneys and towers in front of the sky look like movers where few images show t
 ITERATIONS, LARGE = 3, 4000
 """Of GrabCut, and pixels from which on it is done at half the size."""
 FOLLOWED, INNER = 0.7, 3
-"""Correlation with the neighbour from which an object is followed, and pixels across which it is shrunk there
-where the camera did not turn: its outline is uncertain, and followed on along the path."""
+"""Correlation with the neighbour from which an object is followed, and pixels across which it is shrunk there where the
+camera did not turn, as its outline is uncertain."""
 
 
 def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence, levels: NDArray[np.int16]) -> Mask:
