@@ -1,7 +1,10 @@
 """Depth of most pixels of the training images: dense matches between neighbouring views, each with its error.
 
-docs/depth.md has the steps. Threads share the images (OpenCV and NumPy release Python's lock), and an image is in
-memory only while its neighbours are worked on.
+Every image is compared with its nearest neighbours. A rough depth, from SfM points and planes searched at a low
+resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by optical
+flow (``ops/motion``), is small. A match on its epipolar line gives an inverse depth; consistent matches of several
+neighbours are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV and
+NumPy release Python's lock), and an image is in memory only while its neighbours are worked on.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their

@@ -1,7 +1,9 @@
-"""Depth where hardly any other training image looks: extrapolated from surrounding surfaces (docs/depth.md).
+"""Depth where hardly any other training image looks: extrapolated from surrounding surfaces.
 
-A plane n.x = d appears along the unit direction v at the inverse distance n.v / d, which is linear in v for any lens.
-So w.v is fitted to the inverse distances of the known pixels around a pixel.
+In regions that at most one other training image shows, such as the borders of the first image of a drive, little can be
+matched, and content at many distances explains the colours. There, nearby known surfaces (the road, a wall) are
+extrapolated. A plane n.x = d appears along the unit direction v at the inverse distance n.v / d, which is linear in v
+for any lens. So w.v is fitted to the inverse distances of the known pixels around a pixel.
 """
 
 from __future__ import annotations

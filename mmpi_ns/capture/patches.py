@@ -1,7 +1,9 @@
-"""Depths of a view at a low resolution: patches of planes that make its neighbours look like it (docs/depth.md).
+"""Depths of a view at a low resolution: patches of planes that make its neighbours look like it.
 
-Random planes are compared at a small size, the good ones spread from pixel to pixel, and larger sizes refine them
-(``ops/patches``).
+Dense matching (``dense.py``) starts from rough depths. Between the SfM points of a capture of few images these are
+wrong by more than optical flow mends: a wall beside the path is twice as large in one image as in the one before. A
+plane through a patch predicts how a neighbour shows it, magnified and slanted. Random planes are compared at a small
+size, the good ones spread from pixel to pixel, and larger sizes refine them (``ops/patches``).
 """
 
 from __future__ import annotations

@@ -1,11 +1,16 @@
 """Exposure and white balance of the training images, from the colours of surfaces that several of them show.
 
-Of a surface that images i and j show, r from their middles (1 is a corner), gains k of both and the fall-off (a, b) of
-the lens are solved for, robustly, from
+Cameras with automatic exposure brighten and darken the same wall. A gain for each image and channel is found from the
+known depths: a pixel whose surface another image shows at the same distance gives the ratio of the two colours. The
+ratio also depends on where in the image a surface lies: lenses darken their borders (vignetting), and on a straight
+drive every surface moves from the middle to the border, so that each image seems darker than the one before. Therefore
 
-    log c_j - log c_i = k_j - k_i + a (r_j^2 - r_i^2) + b (r_j^4 - r_i^4)        k_j - k_i = s log(E_j / E_i) by EXIF
+    log c_j - log c_i = k_j - k_i + a (r_j^2 - r_i^2) + b (r_j^4 - r_i^4)
 
-docs/exposure.md says why it takes the fall-off, and when gains are used.
+is solved for the gains k and the fall-off (a, b) together, robustly, with exposure times from EXIF as further equations
+k_j - k_i = s log(E_j / E_i), s unknown as the camera's tone curve is. Gains are used only if they predict the ratios of
+image pairs that were left out. Colours are those of the files: for a tone curve near a power law a change of exposure
+multiplies them.
 """
 
 from __future__ import annotations

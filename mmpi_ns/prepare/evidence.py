@@ -1,8 +1,11 @@
-"""Evidence on the correctness of a reconstruction, which a wrong track cannot fake (docs/prepare.md lists it).
+"""Evidence on the correctness of a reconstruction, which a wrong track cannot fake.
 
 A track that breaks and continues at another scale, or folds over, has a small reprojection error: each part fits its
 own points. But matches between the parts do not fit. So the evidence is taken from the verified matches of image
-pairs, which do not depend on any track.
+pairs, which do not depend on any track: how many became points that both images see, and how many lie on the epipolar
+lines of the two poses, also separately for the pairs across each gap between two frames. In addition, points seen on
+both sides of a gap are triangulated twice, from either side alone: if the scale changes, the two differ. The results of
+two different mappers are compared as well.
 
 All but ``witness_of``, which reads a model and its database, are pure functions of numpy arrays.
 """
