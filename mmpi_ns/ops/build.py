@@ -11,7 +11,8 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Sequence
+import weakref
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ FORMS = {int: ctypes.c_int64, bool: ctypes.c_bool, float: ctypes.c_float}
 """What numbers are passed as."""
 ENTRIES_PER_PART = 1024
 """Entries that are looked at to divide sums evenly among threads."""
+MOST_PARTS = (1 << 16) - 1
+"""Of a function that is left to other threads (``cpp/parts.h``)."""
 
 
 class CannotCompile(Exception):
@@ -125,10 +128,44 @@ def call_in_parts(name: str, parts: int | Sequence[int], *values: Any, least: in
         least: numbers of an even part, at least.
     """
     bounds = even_bounds(parts, least) if isinstance(parts, int) else parts
-    function = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
-    assert function is not None
     how = (ctypes.c_int64 * len(bounds))(*bounds), ctypes.c_int64(len(bounds) - 1)
-    ctypes.CFUNCTYPE(None)(function)(*how, *arguments(values))
+    _function(f"{name}_in_parts")(*how, *arguments(values))
+
+
+class Pending:
+    """A compiled function that other threads work on while they have nothing else to do."""
+
+    def __init__(self, name: str, number: int, values: Sequence[Any]) -> None:
+        self._values = values  # live as long
+        self._finish = functools.partial(_function(f"{name}_finish"), ctypes.c_int64(number))
+        weakref.finalize(self, self._finish)  # before the values go, at the latest at the end of the process
+
+    def finish(self) -> None:
+        """Returns when the function has written all of its results."""
+        self._finish()
+
+
+def leave_in_parts(name: str, count: int, size: int, *values: Any) -> Pending | None:
+    """Leaves a compiled function of ``(begin, end, *values)`` for 0 to ``count`` to other threads, which call it for
+    ``size`` numbers at a time. None where there are too few numbers or no other threads: nothing is called.
+
+    Args:
+        name: of the function, which has LATER_IN_PARTS in ``cpp/parts.h``.
+        count: of the numbers.
+        size: of a part, at least: an operation that is waited for may wait for one of them.
+        values: further arguments (``arguments``).
+    """
+    helpers, size = num_threads() - 1, max(size, -(-count // MOST_PARTS))
+    if helpers < 1 or count <= helpers * size:
+        return None
+    return Pending(name, _function(f"{name}_later")(*arguments((count, size, helpers, *values))), values)
+
+
+@functools.cache
+def _function(name: str) -> Callable[..., int]:
+    address = ctypes.c_void_p.in_dll(library(), name).value
+    assert address is not None
+    return ctypes.CFUNCTYPE(ctypes.c_int64)(address)
 
 
 def even_bounds(count: int, least: int = 256) -> list[int]:

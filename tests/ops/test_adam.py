@@ -10,7 +10,7 @@ from compiled import both, compiled, normal  # noqa: F401
 from torch.nn import Parameter
 
 from mmpi_ns.ops.adam import AdamConstants, adam_rows
-from mmpi_ns.ops.interpolate import Table
+from mmpi_ns.ops.interpolate import Table, interpolate, read_rows
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.touched_adam import TouchedAdam, TouchedAdamConfig
 
@@ -232,6 +232,67 @@ def test_adam_on_rows_equals_the_plain_one_to_the_last_bits(channels):
     for a, b in zip(fast, plain, strict=True):  # here and there a moment falls on the other side of a half
         off = (a - b).abs()
         assert (off <= 4e-6 * (1 + b.abs())).float().mean() > 0.995 and (off <= 2**-7 * b.abs() + 1e-3).all()
+
+
+@pytest.fixture
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_steps_that_are_left_to_other_threads_have_the_same_bits(compiled, three_threads):  # noqa: F811
+    def trained(threads):
+        torch.set_num_threads(threads)
+        param, read = Table(normal(30_000, 8)), []
+        optimizer = TouchedAdam([param], lr=0.1)
+        for step in range(8):
+            rows = chosen_rows(30_000, 20_000, step)
+            read.append(read_rows(param, rows).detach())
+            param.grad = None
+            param.add_grad(rows, normal(20_000, 8, seed=step))
+            optimizer.step()
+            assert (param.pending is not None) == (threads > 1)
+        return *read, optimizer.state_dict()["state"][0]["moments"].float(), param.data
+
+    assert all(torch.equal(a, b) for a, b in zip(trained(3), trained(1), strict=True))
+
+
+TAPS = torch.zeros(5, 4, dtype=torch.int64), torch.ones(5, 4)
+"""Rows and weights of samples."""
+
+
+class Unfinished:
+    def __init__(self):
+        self.times = 0
+
+    def finish(self):
+        self.times += 1
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda param, _: param.data,
+        lambda param, _: param.detach(),
+        lambda param, _: setattr(param, "data", torch.zeros(500, 8)),
+        lambda param, _: read_rows(param, torch.arange(5)),
+        lambda param, _: interpolate(param, *TAPS),
+        lambda param, _: interpolate(param.requires_grad_(False), *TAPS),
+        lambda _, optimizer: optimizer.state_dict(),
+        lambda param, optimizer: optimizer.keep_bricks(param, torch.arange(2)),
+        lambda _, optimizer: optimizer.step(),
+    ],
+)
+def test_whatever_reads_a_table_or_its_moments_waits_for_the_step(read):
+    param = Table(normal(512, 8))
+    optimizer = TouchedAdam([param], lr=0.1)
+    param.add_grad(torch.arange(64, 512), normal(448, 8))
+    optimizer.step()
+    param.pending = unfinished = Unfinished()
+    read(param, optimizer)
+    assert unfinished.times == 1 and param.pending is not unfinished
 
 
 def chosen_rows(count, chosen, seed):

@@ -8,9 +8,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.build import call_in_parts
+from mmpi_ns.ops.build import Pending, call_in_parts, leave_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.scene.texels import BRICK
+
+AT_LEAST = 4096
+"""Rows that are worth another thread."""
+AT_ONCE = 1024
+"""Rows of a part that is left to other threads, for which an operation may have to wait: some 0.05 ms."""
 
 
 class AdamConstants(NamedTuple):
@@ -32,7 +37,7 @@ def adam_rows(
     rows: Int[Tensor, "U"],
     grad: Float[Tensor, "U C"],
     constants: AdamConstants,
-) -> None:
+) -> Pending | None:
     """One step of Adam on distinct rows. The empty brick, and entries whose gradient is exactly 0, are left alone.
 
     Args:
@@ -41,11 +46,15 @@ def adam_rows(
         rows: of the gradient (``Table.grad_rows``).
         grad: of those rows.
         constants: of the step.
+
+    Returns:
+        What is to be kept until ``param`` and ``moments`` are read, and finished before; None: nothing.
     """
     grad = grad.masked_fill((rows < BRICK)[:, None], 0)
     new_param, new_moments = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)
     param.index_copy_(0, rows, new_param)
     moments.index_copy_(0, rows, new_moments)
+    return None
 
 
 def adam(
@@ -65,8 +74,13 @@ def adam(
 
 
 @adam_rows.on_cpu
-def adam_rows_on_cpu(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: AdamConstants) -> None:
+def adam_rows_on_cpu(
+    param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: AdamConstants
+) -> Pending | None:
     if not param.is_contiguous() or moments.dtype != torch.bfloat16:
         return adam_rows.reference(param, moments, rows, grad, constants)
     step = (rows.contiguous(), param.shape[1], grad.contiguous(), param, moments, *map(float, constants))
-    call_in_parts("mmpi_adam_rows", len(rows), *step, least=4096)
+    pending = leave_in_parts("mmpi_adam_rows", len(rows), AT_ONCE, *step)
+    if pending is None:
+        call_in_parts("mmpi_adam_rows", len(rows), *step, least=AT_LEAST)
+    return pending

@@ -1,9 +1,11 @@
 // Parts of an operation, each by a thread. Whatever a part is, an operation writes the same bits for any number of them.
 #pragma once
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
 #include <cstdint>
+#include <functional>
 #include <mutex>
 #include <thread>
 #include <unistd.h>
@@ -17,53 +19,105 @@ inline void relax() { std::atomic_signal_fence(std::memory_order_seq_cst); }
 // Number of the part that this thread works on.
 inline thread_local int64_t this_part = 0;
 
-// Threads that wait for parts: awake for a moment, since a step has dozens of operations, then asleep. Whoever is there
-// first takes the next part, also the caller, so nobody waits for a thread that has no core.
-class Crew {
-    using Job = void (*)(const void*, int64_t);
-    static constexpr auto AWAKE = std::chrono::microseconds(100);
-    static constexpr uint64_t ONE = 1, MOST = (1 << 16) - 1; // a ticket: number of the job, its parts, the next of them
+// Jobs that may be left to other threads at once; one more waits for the oldest.
+constexpr int64_t LATER = 4;
 
-    std::mutex one_caller, lock;
-    std::condition_variable work;
+// The parts of one job. Whoever is there first takes the next one.
+class Parts {
+    static constexpr uint64_t ONE = 1; // a ticket: number of the job, its parts, the next of them
     std::atomic<uint64_t> ticket{0};
-    std::atomic<int64_t> unfinished{0}, asleep{0};
-    Job job = nullptr;
-    const void* what = nullptr;
-    int64_t threads = 0;
-    pid_t process = 0;
+    std::atomic<int64_t> unfinished{0};
+    std::function<void(int64_t)> job;
 
-    static bool has_parts(uint64_t now) { return (now & MOST) < (now >> 16 & MOST); }
+  public:
+    static constexpr int64_t MOST = (1 << 16) - 1;
 
-    // Works on one part, if there is one.
+    bool are_left() const {
+        const uint64_t now = ticket.load();
+        return (now & MOST) < (now >> 16 & MOST);
+    }
+
+    // Works on one part, if one is left.
     bool take() {
         uint64_t now = ticket.load();
-        while (has_parts(now)) {
+        while ((now & MOST) < (now >> 16 & MOST)) {
             if (!ticket.compare_exchange_weak(now, now + ONE)) continue;
             this_part = int64_t(now & MOST);
-            job(what, this_part); // stays until the last part is finished
+            job(this_part); // stays until the last part is finished
             unfinished.fetch_sub(1);
             return true;
         }
         return false;
     }
 
+    // The next job; the one before is finished.
+    void put(int64_t parts, std::function<void(int64_t)> each) {
+        job = std::move(each);
+        unfinished.store(parts);
+        ticket.store(((ticket.load() >> 32) + 1) << 32 | uint64_t(parts) << 16);
+    }
+
+    // Works on what is left and waits for the parts of others, meanwhile on whatever `otherwise` finds.
+    template <class Otherwise> void finish(const Otherwise& otherwise) {
+        while (take()) {}
+        for (int spins = 0; unfinished.load();)
+            if (!otherwise()) spins++ < 2000 ? relax() : std::this_thread::yield();
+    }
+};
+
+// Threads that wait for parts: awake for a moment, since a step has dozens of operations, then asleep. The caller takes
+// parts, too, so nobody waits for a thread that has no core. Threads that have no part of an operation that is waited
+// for work on those that are not, in the order in which they came.
+class Crew {
+    static constexpr auto AWAKE = std::chrono::microseconds(100);
+
+    std::mutex one_caller, one_leaver, lock;
+    std::condition_variable work;
+    std::atomic<int64_t> asleep{0}, oldest{0};
+    Parts urgent, later[LATER];
+    int64_t threads = 0;
+    pid_t process = 0;
+
+    bool take_later() {
+        const int64_t first = oldest.load();
+        for (int64_t i = 0; i < LATER; i++)
+            if (later[(first + i) % LATER].take()) return true;
+        return false;
+    }
+
+    bool has_parts() const {
+        return urgent.are_left() || std::any_of(later, later + LATER, [](const Parts& parts) { return parts.are_left(); });
+    }
+
     void wait() {
         const auto until = std::chrono::steady_clock::now() + AWAKE;
         while (std::chrono::steady_clock::now() < until)
             for (int i = 0; i < 32; i++) {
-                if (has_parts(ticket.load(std::memory_order_relaxed))) return;
+                if (has_parts()) return;
                 relax();
             }
         std::unique_lock<std::mutex> held(lock);
         asleep.fetch_add(1);
-        work.wait(held, [&] { return has_parts(ticket.load()); });
+        work.wait(held, [&] { return has_parts(); });
         asleep.fetch_sub(1);
     }
 
     [[noreturn]] void live() {
         for (;;)
-            if (!take()) wait();
+            if (!urgent.take() && !take_later()) wait();
+    }
+
+    bool is_forked() const { return process && process != getpid(); }
+
+    void wake(int64_t helpers) {
+        {
+            const std::lock_guard<std::mutex> held(lock);
+            for (process = getpid(); threads < helpers; threads++) std::thread([this] { live(); }).detach();
+        }
+        if (asleep.load()) {
+            const std::lock_guard<std::mutex> held(lock);
+            work.notify_all();
+        }
     }
 
   public:
@@ -71,22 +125,33 @@ class Crew {
     // none, works alone.
     template <class Each> void run(int64_t parts, const Each& each) {
         std::unique_lock<std::mutex> mine(one_caller, std::defer_lock);
-        const bool alone = parts == 1 || parts > int64_t(MOST) || (process && process != getpid()) || !mine.try_lock();
-        if (alone) {
+        if (parts == 1 || parts > Parts::MOST || is_forked() || !mine.try_lock()) {
             for (this_part = 0; this_part < parts; this_part++) each(this_part);
             return;
         }
-        for (process = getpid(); threads < parts - 1; threads++) std::thread([this] { live(); }).detach();
-        job = [](const void* each, int64_t part) { (*static_cast<const Each*>(each))(part); };
-        what = &each;
-        unfinished.store(parts);
-        ticket.store(((ticket.load() >> 32) + 1) << 32 | uint64_t(parts) << 16);
-        if (asleep.load()) {
-            const std::lock_guard<std::mutex> held(lock);
-            work.notify_all();
+        urgent.put(parts, std::cref(each));
+        wake(parts - 1);
+        urgent.finish([this] { return take_later(); });
+    }
+
+    // Leaves each(part) for all parts, at most MOST, to so many other threads. Returns the job's number for `finish`.
+    template <class Each> int64_t leave(int64_t parts, int64_t helpers, const Each& each) {
+        const std::lock_guard<std::mutex> mine(one_leaver);
+        const int64_t number = oldest.load();
+        if (is_forked()) {
+            for (int64_t part = 0; part < parts; part++) each(part);
+            return number;
         }
-        while (take()) {}
-        for (int spins = 0; unfinished.load(); spins++) spins < 2000 ? relax() : std::this_thread::yield();
+        finish(number);
+        later[number].put(parts, each);
+        oldest.store((number + 1) % LATER);
+        wake(helpers);
+        return number;
+    }
+
+    // Returns when a job that was left is finished. In a forked process no other thread would finish its parts.
+    void finish(int64_t number) {
+        if (!is_forked()) later[number].finish([] { return false; });
     }
 };
 
@@ -100,7 +165,19 @@ template <class... A, void (*F)(int64_t, int64_t, A...)> struct InParts<F> {
     static void run(const int64_t* bounds, int64_t parts, A... arguments) {
         crew().run(parts, [&](int64_t part) { F(bounds[part], bounds[part + 1], arguments...); });
     }
+    static int64_t leave(int64_t count, int64_t size, int64_t helpers, A... arguments) {
+        return crew().leave((count + size - 1) / size, helpers, [=](int64_t part) {
+            F(part * size, std::min(count, (part + 1) * size), arguments...);
+        });
+    }
+    static void finish(int64_t number) { crew().finish(number); }
 };
 
 // Makes an operation of (begin, end, ...) callable for all parts between bounds (ops/build.call_in_parts).
 #define IN_PARTS(NAME) extern "C" { void* NAME##_in_parts = reinterpret_cast<void*>(&InParts<&NAME>::run); }
+// And one that may be left to other threads (ops/build.leave_in_parts).
+#define LATER_IN_PARTS(NAME)                                                                                           \
+    extern "C" {                                                                                                       \
+    void* NAME##_later = reinterpret_cast<void*>(&InParts<&NAME>::leave);                                              \
+    void* NAME##_finish = reinterpret_cast<void*>(&InParts<&NAME>::finish);                                            \
+    }

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor, nn
 
-from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds
+from mmpi_ns.ops.build import Pending, call_in_parts, even_bounds, owned_bounds
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
@@ -37,11 +37,38 @@ class Table(nn.Parameter):
 
     ``read_rows`` brings the gradient and ``TouchedAdam`` takes it. Whatever treats gradients number by number works as
     with any parameter: dropping, scaling, clipping and norms, in torch and in nerfstudio.
+
+    The optimiser may leave its step to other threads. ``data``, ``detach`` and ``read_rows`` wait for it; other
+    operations on the parameter itself do not.
     """
 
     grad_rows: Int[Tensor, "U"] | None = None
     """Rising and each once, but that row 0 with a gradient of 0 may follow any number of times."""
     _row_grad: Float[Tensor, "U C"] | None = None
+    pending: Pending | None = None
+    """A step of the optimiser that other threads work on."""
+
+    def settle(self) -> None:
+        """Returns when the optimiser's step is finished."""
+        if self.pending is not None:
+            self.pending.finish()
+            self.pending = None
+
+    @property
+    def data(self) -> Float[Tensor, "T C"]:  # type: ignore[override]
+        """The values, without gradients."""
+        self.settle()
+        return super().data
+
+    @data.setter
+    def data(self, values: Float[Tensor, "T C"]) -> None:
+        self.settle()
+        Tensor.data.__set__(self, values)  # type: ignore[attr-defined]
+
+    def detach(self) -> Float[Tensor, "T C"]:
+        """The values, without gradients."""
+        self.settle()
+        return super().detach()
 
     @property
     def grad(self) -> Float[Tensor, "U C"] | None:  # type: ignore[override]
@@ -170,8 +197,10 @@ def interpolate(
     table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
     """``weigh_rows`` of a table, whose gradient goes to its ``grad`` if it is a ``Table``."""
-    if not (isinstance(table, Table) and table.requires_grad and torch.is_grad_enabled()):
+    if not isinstance(table, Table):
         return weigh_rows(table, rows, weights)
+    if not (table.requires_grad and torch.is_grad_enabled()):
+        return weigh_rows(table.data, rows, weights)
     index = index_rows(rows, len(table), pads=True)
     return weigh_rows(read_rows(table, index.unique), index.positions, weights)
 
@@ -187,7 +216,7 @@ class _ReadRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Table, rows: Tensor) -> Tensor:
         ctx.table, ctx.rows = table, rows
-        return take_rows(table, rows)
+        return take_rows(table.data, rows)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[None, None]:

@@ -71,16 +71,17 @@ def clamped_differences(
 
 
 class WithGradient(torch.autograd.Function):
-    """A loss whose gradient was computed with it."""
+    """A loss whose gradient was computed with it, for one backward pass."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, loss: Tensor, gradient: Tensor) -> Tensor:
-        ctx.save_for_backward(gradient)
+        ctx.gradient = gradient
         return loss
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
-        return ctx.saved_tensors[0] * grad_outputs[0], None, None
+        gradient, ctx.gradient = ctx.gradient, None  # scaled in place: it is as large as what the batch read
+        return gradient.mul_(grad_outputs[0]), None, None
 
 
 PART = 4096
