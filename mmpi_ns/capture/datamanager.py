@@ -348,7 +348,7 @@ def load_observations(
         downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
         moving: file for a picture of what moves. None: neither movers nor depths of pixels are searched, which takes
-            minutes; tracks or a plane sweep take their place.
+            minutes; tracks or searched surfaces take their place.
     """
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()

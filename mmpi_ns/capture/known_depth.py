@@ -37,7 +37,7 @@ from mmpi_ns.utils.parallel import in_order, num_threads
 
 Codes = NDArray[np.int16]
 
-VERSION = 16
+VERSION = 17
 """Version of the algorithm: cached depths of another version are recomputed."""
 FINER, LONGEST = 2.0, 1600
 """Images are matched at this multiple of the training size, if the originals are available, and their longer side has
