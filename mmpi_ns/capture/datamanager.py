@@ -22,7 +22,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, opened, say_once
+from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
@@ -35,7 +35,8 @@ from mmpi_ns.capture.rays import CameraRays
 from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.utils.errors import InputError, looked_at, say
+from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.files import opened
 from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import generator
 from mmpi_ns.utils.values import check_options
@@ -329,12 +330,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             future = self._thread.submit(draw, generator(seed, step + 1, "pixels", device))
             self._ahead = sources, (step + 1, pixel_rays), future
         return batch
-
-
-def check_there(data: Path) -> None:
-    """Raises InputError where there is neither a folder nor a file."""
-    if not data.exists():
-        raise InputError(f"There is no scene at {looked_at(data)}: check the path.")
 
 
 def load_observations(

@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from mmpi_ns.capture.checks import UNREADABLE, check_places, names_of_copies, opened, say_once
+from mmpi_ns.capture.checks import check_places, names_of_copies, say_once
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
 from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.files import UNREADABLE, opened
 from mmpi_ns.utils.host import transforms_changed
 
 SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")

@@ -129,16 +129,19 @@ class Details:
         return shown
 
 
-def read_details(folder: Path) -> tuple[int, Details]:
-    """What ``write_details`` has written, and the step of its checkpoint. Raises InputError if it is damaged."""
-    step, cameras = _load(folder / CAMERAS_FILE, "step", "cameras")
+def details_of(folder: Path, step: int) -> Details | None:
+    """What ``write_details`` has written for the checkpoint of a step; None if there is nothing, or it is another's.
+    Raises InputError if it is damaged."""
+    if not (folder / CAMERAS_FILE).is_file():
+        return None
+    kept_at, cameras = _load(folder / CAMERAS_FILE, "step", "cameras")
 
     def read(i: int, device: torch.device) -> DetailView:
         difference, inverse = (x.to(device) for x in _load(folder / f"{i:05d}.npz", "difference", "inverse"))
         image = torch.cat([difference.float() * (LARGEST / LEVELS), inverse.float()[..., None]], -1)
         return DetailView(image, cameras[i].to(device))
 
-    return int(step), Details(cameras, read)
+    return Details(cameras, read) if int(kept_at) == step else None
 
 
 def _load(path: Path, *names: str) -> list[Tensor]:
@@ -151,13 +154,6 @@ def _load(path: Path, *names: str) -> list[Tensor]:
             f"{path} is damaged ({brief(error)}): remove the folder {path.parent}, and images show the field alone, or "
             "train again."
         ) from error
-
-
-def details_of(folder: Path, step: int) -> Details | None:
-    """The details of a run that belong to its checkpoint of a step; None if it has none. Raises InputError if they are
-    damaged."""
-    kept_at, details = read_details(folder) if (folder / CAMERAS_FILE).is_file() else (None, None)
-    return details if kept_at == step else None
 
 
 def moved_cameras(cameras: Cameras, poses: CameraOptimizer) -> Cameras:

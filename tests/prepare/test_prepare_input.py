@@ -20,7 +20,6 @@ from mmpi_ns.prepare.images import (
     gather,
     gather_masks,
     measure,
-    open_image,
     select_frames,
     sharpness,
 )
@@ -324,7 +323,7 @@ def test_an_image_that_pillow_takes_for_an_attack_is_named(tmp_path, monkeypatch
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 30)
     Image.new("RGB", (9, 9)).save(tmp_path / "huge.png")
     with pytest.raises(InputError, match=r"huge.png cannot be read \(Image size \(81 pixels\)"):
-        open_image(tmp_path / "huge.png")
+        gather(tmp_path, [tmp_path / "huge.png"], tmp_path / "work")
 
 
 def test_blank_images_are_refused(tmp_path):

@@ -22,7 +22,6 @@ from mmpi_ns.rendering.details import (
     blended_details,
     details_of,
     moved_cameras,
-    read_details,
     write_details,
 )
 from mmpi_ns.utils.errors import InputError
@@ -86,7 +85,7 @@ def test_what_is_written_is_read(tmp_path):
     planes = [random_planes(i, 4.0) for i in range(3)]
     cameras = joined(camera(), camera(0.3), camera(0.6, turn=0.2))
     assert "Details of 3 training images" in write(tmp_path, cameras, planes, factors=[[0.8, 1.0, 1.2]] * 3)
-    details = read_details(tmp_path)[1]
+    details = read_details(tmp_path)
     for i, expected in enumerate(planes):
         view = details.view(i, torch.device("cpu"))
         assert torch.allclose(view.camera[:12].view(3, 4), cameras.camera_to_worlds[i])
@@ -96,25 +95,32 @@ def test_what_is_written_is_read(tmp_path):
         assert torch.allclose(inverse, expected[3], rtol=1e-3)
 
 
+def read_details(folder):
+    """Those of ``write``."""
+    details = details_of(folder, 7)
+    assert details is not None
+    return details
+
+
 def test_an_image_at_a_training_camera_gets_its_details(tmp_path):
     planes = [random_planes(0, 4.0)]
     write(tmp_path, joined(camera()), planes)
     bundle = image_rays(camera())
     outputs = {"depth": 1 / planes[0][3][..., None], "accumulation": torch.ones(HEIGHT, WIDTH, 1),
                "rgb": torch.full((HEIGHT, WIDTH, 3), 0.5)}  # fmt: skip
-    shown = read_details(tmp_path)[1].added(outputs, bundle, 4, None)
+    shown = read_details(tmp_path).added(outputs, bundle, 4, None)
     expected = STRENGTH * planes[0][:3].movedim(0, -1)
     assert torch.allclose(shown["rgb"], (0.5 + expected).clamp(0, 1), atol=4e-3)
     assert bool((shown["field_rgb"] == 0.5).all())
-    double = read_details(tmp_path)[1].added(outputs, bundle, 4, torch.full((3,), 2.0))
+    double = read_details(tmp_path).added(outputs, bundle, 4, torch.full((3,), 2.0))
     assert torch.allclose(double["rgb"], (0.5 + 2 * expected).clamp(0, 1), atol=8e-3)
-    light = read_details(tmp_path)[1].added(outputs | {"radiance": outputs["rgb"]}, bundle, 4, None)
+    light = read_details(tmp_path).added(outputs | {"radiance": outputs["rgb"]}, bundle, 4, None)
     assert torch.allclose(light["radiance"], 0.5 + expected, atol=4e-3) and bool((light["field_radiance"] == 0.5).all())
 
 
 def test_other_surfaces_masks_and_empty_pixels_show_nothing(tmp_path):
     def added(outputs, rays):
-        return read_details(tmp_path)[1].added(outputs, rays, 4, None)["rgb"]
+        return read_details(tmp_path).added(outputs, rays, 4, None)["rgb"]
 
     planes = [torch.cat([torch.full((3, HEIGHT, WIDTH), 0.2), torch.full((1, HEIGHT, WIDTH), 0.25)])]
     bundle, open_ = image_rays(camera(0.4)), torch.ones(HEIGHT, WIDTH, 1)
@@ -137,7 +143,7 @@ def test_details_change_smoothly_as_a_camera_moves(tmp_path):
         for sign in (1, -1, -1, 1, 1, -1)
     ]
     write(tmp_path, joined(*(camera(0.2 * i) for i in range(6))), planes)
-    details, shown = read_details(tmp_path)[1], []
+    details, shown = read_details(tmp_path), []
     for x in np.linspace(0.2, 0.8, 241):
         bundle = image_rays(camera(float(x)))
         nothing, whole = torch.zeros(HEIGHT, WIDTH, 3), torch.ones(HEIGHT, WIDTH, 1)
@@ -182,7 +188,7 @@ def test_damaged_details_are_named(tmp_path):
     write(tmp_path, joined(camera()), [random_planes(0, 4.0)])
     (tmp_path / "00000.npz").write_bytes(b"no archive")
     with pytest.raises(InputError, match=r"00000\.npz is damaged.*remove the folder"):
-        read_details(tmp_path)[1].view(0, torch.device("cpu"))
+        read_details(tmp_path).view(0, torch.device("cpu"))
     (tmp_path / "cameras.npz").write_bytes(b"")
     with pytest.raises(InputError, match=r"cameras\.npz is damaged"):
         details_of(tmp_path, 7)
