@@ -46,10 +46,7 @@ class Score:
     lpips: Literal["vgg", "alex", "none"] = "vgg"
     """Network of LPIPS; it is left out where the weights are not available."""
 
-    def main(self) -> None:
-        self.score()
-
-    def score(self) -> tuple[Scores, dict[str, float]]:
+    def main(self) -> tuple[Scores, dict[str, float]]:
         """Scores, prints and returns name and metrics of each image, and the means."""
         counts = {name: Number(0, whole=True) for name in ("downscale_factor", "test_images")}
         check_options(self, counts, "--")

@@ -256,10 +256,10 @@ class Preparation:
     def _split(self, names: Sequence[str]) -> export.Split:
         s = self.settings
         if s.split_from is not None:
-            return export.split_from(read_lists(s.split_from), names, s.split_from.name)
+            return export.split_images(names, lists=read_lists(s.split_from), source=s.split_from.name)
         if self.known_poses is not None and self.known_poses.split and s.test_every is None and s.train_every is None:
-            return export.split_from(self.known_poses.split, names, f"{s.poses}")
-        return export.split_by_count(names, s.test_every, s.train_every)
+            return export.split_images(names, lists=self.known_poses.split, source=f"{s.poses}")
+        return export.split_images(names, s.test_every, s.train_every)
 
     def _check(
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split, built: Path

@@ -59,30 +59,6 @@ class DetailView:
     camera: Float[Tensor, "24"]
 
 
-def blended_details(
-    views: list[DetailView],
-    shares: list[float],
-    origins: Float[Tensor, "P 3"],
-    directions: Float[Tensor, "P 3"],
-    depth: Float[Tensor, "P 1"],
-) -> Float[Tensor, "P 3"]:
-    """What to add to the radiance of rays: the weighted mean of the differences that training images show.
-
-    Args:
-        views: the training images.
-        shares: factor on the weights of each.
-        origins: of the rays.
-        directions: of the rays, unit length.
-        depth: distances of their surfaces along the rays; infinity is allowed.
-    """
-    total, weight, inverse = torch.zeros_like(origins), torch.full_like(depth, LEAST_WEIGHT), 1 / depth
-    for view, share in zip(views, shares, strict=True):
-        difference, seen = seen_details(origins, directions, inverse, view.image, view.camera)
-        total += share * seen * difference
-        weight += share * seen
-    return STRENGTH * total / weight
-
-
 class Details:
     """Training images with what the field lacks in them, read as images need them.
 
@@ -118,10 +94,16 @@ class Details:
         distances = np.linalg.norm(self._poses[chosen, :, 3] - pose[0, :, 3], axis=-1)
         limit = distances[-1] if len(chosen) > nearest and distances[-1] > 0 else np.inf
         chosen, shares = chosen[:nearest], (1 - (distances / limit) ** 2)[:nearest].tolist()
-        views = [self.view(i, origins.device) for i in chosen]
-        rays = zip(*(x.split(PART) for x in (origins, directions, outputs["depth"].reshape(-1, 1))), strict=True)
-        detail = torch.cat([blended_details(views, shares, *part) for part in rays]).view(bundle.origins.shape)
-        detail = detail * outputs["accumulation"]
+        views, details = [self.view(i, origins.device) for i in chosen], []
+        columns = (origins, directions, 1 / outputs["depth"].reshape(-1, 1))
+        for rays in zip(*(x.split(PART) for x in columns), strict=True):  # the weighted mean of what the views show
+            total, weight = torch.zeros_like(rays[0]), torch.full_like(rays[2], LEAST_WEIGHT)
+            for view, share in zip(views, shares, strict=True):
+                difference, seen = seen_details(*rays, view.image, view.camera)
+                total += share * seen * difference
+                weight += share * seen
+            details.append(STRENGTH * total / weight)
+        detail = torch.cat(details).view(bundle.origins.shape) * outputs["accumulation"]
         rgb = (outputs["rgb"] + (detail if exposure is None else exposure * detail)).clamp(0, 1)
         shown = outputs | {"rgb": rgb, "field_rgb": outputs["rgb"]}
         if "radiance" in outputs:

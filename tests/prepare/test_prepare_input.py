@@ -246,12 +246,12 @@ def test_look_alikes_are_found_by_their_features(tmp_path):
 
 def test_split_by_count_and_by_list():
     names = [f"{i}.jpg" for i in range(9)]
-    split = export.split_by_count(names, None, 3)
+    split = export.split_images(names, None, 3)
     assert split.train == ("1.jpg", "4.jpg", "7.jpg") and len(split.test) == 6
     lists = {"train_filenames": ["x/2.jpg"], "test_filenames": ["x/3.jpg", "x/99.jpg"]}
-    assert export.split_from(lists, names, "s").test == ("3.jpg",)
+    assert export.split_images(names, lists=lists, source="s").test == ("3.jpg",)
     with pytest.raises(InputError, match="among the registered"):
-        export.split_from({"train_filenames": ["2.jpg"], "test_filenames": ["77.jpg"]}, names, "s")
+        export.split_images(names, lists={"train_filenames": ["2.jpg"], "test_filenames": ["77.jpg"]}, source="s")
 
 
 def write_video(path, frames):

@@ -11,6 +11,7 @@ import pytest
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.rays import RayBundle
 
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
@@ -18,8 +19,8 @@ from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH
 from mmpi_ns.rendering.details import (
     LARGEST,
     LEVELS,
+    Details,
     DetailView,
-    blended_details,
     details_of,
     moved_cameras,
     write_details,
@@ -43,18 +44,26 @@ def random_planes(seed: int, depth: float) -> torch.Tensor:
 
 
 def test_details_are_the_weighted_mean_of_the_views():
-    """Of two cameras to the left and to the right: by shares and viewing angles, worked out by hand."""
-    views = []
+    """Of two cameras to the left and to the right: by shares and viewing angles, worked out by hand. A third one, where
+    shares reach 0, is not read."""
+    views, cameras = [], []
     for x, value in ((-0.5, 0.2), (1.0, -0.1)):
         numbers = torch.tensor([1.0, 0, 0, x, 0, 1, 0, 0, 0, 0, 1, 0, 22, 21, 14.5, 9, *[0.0] * 7, 10])
         inverse = 1 / math.hypot(x, 5)
         views.append(DetailView(torch.tensor([value] * 3 + [inverse]).expand(HEIGHT, WIDTH, 4).contiguous(), numbers))
-    ray = torch.zeros(1, 3), torch.tensor([[0.0, 0, -1]]), torch.tensor([[5.0]])
+        cameras.append(numbers)
+    cameras.append(cameras[-1].index_fill(0, torch.tensor([3]), 2.0))
+    ray = RayBundle(torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0, -1]]]), torch.ones(1, 1, 1))
+    shares = [1 - (distance / 2) ** 2 for distance in (0.5, 1.0)]
     angles = [2 * math.sin(math.atan(x / 5) / 2) for x in (0.5, 1.0)]
-    weights = [share / (angle + 0.01) for angle, share in zip(angles, (0.9, 0.4), strict=True)]
+    weights = [share / (angle + 0.01) for angle, share in zip(angles, shares, strict=True)]
     faded = [value / (1 + (angle / 0.2) ** 2) for angle, value in zip(angles, (0.2, -0.1), strict=True)]
     expected = STRENGTH * (faded[0] * weights[0] + faded[1] * weights[1]) / (sum(weights) + LEAST_WEIGHT)
-    assert torch.allclose(blended_details(views, [0.9, 0.4], *ray), torch.full((1, 3), expected), rtol=1e-3)
+    outputs = {"depth": torch.full((1, 1, 1), 5.0), "accumulation": torch.ones(1, 1, 1), "rgb": torch.zeros(1, 1, 3)}
+    shown = Details(torch.stack(cameras), lambda i, _: views[i]).added(
+        outputs | {"radiance": outputs["rgb"]}, ray, 2, None
+    )
+    assert torch.allclose(shown["radiance"], torch.full((1, 1, 3), expected), rtol=1e-3)
 
 
 def write(folder, cameras, planes, mask=None, step=7, factors=()):
