@@ -7,7 +7,6 @@ Imported only where Triton is wanted (``dispatch.py``): the package runs without
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-from itertools import accumulate
 from typing import Any
 
 import torch
@@ -39,7 +38,7 @@ def grids_of(layout: SceneLayout) -> Int[Tensor, "N"]:
     tiles, places = grids[0].tiles, grids[0].places
     rows = [
         (g.first_tile, g.depth, g.height, g.width, b, g.down, g.across, start + g.first_tile, start + len(tiles))
-        for g, b in zip(grids, accumulate(map(len, layout.biases), initial=0), strict=False)
+        for g, b in zip(grids, layout.bias_starts(), strict=True)
     ]
     head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
     packed = torch.cat([head, tiles.to(device), places.to(device, torch.int32)])

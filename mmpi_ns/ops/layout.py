@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
-from itertools import accumulate
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import torch
@@ -106,14 +105,17 @@ class SceneLayout:
         """Texels of all heads for C++: ``Grid`` of ``cpp/scene.h``."""
         assert self.grids[0].tiles.dtype == torch.int32
         sizes = [(g.depth, g.height, g.width, g.down, g.across, g.first_tile, g.tiles) for g in self.grids]
-        starts = accumulate(map(len, self.biases), initial=0)
-        return structs(*((*each, bias) for each, bias in zip(sizes, starts, strict=False)))
+        return structs(*((*each, bias) for each, bias in zip(sizes, self.bias_starts(), strict=True)))
 
     def cpu_scene(self, tables: Tables) -> ctypes.Array:
         """The layout and its tables for C++: a ``Scene`` of ``cpp/scene.h``."""
         sizes = (len(self.mpis), self.num_heads, float(self.content_near))
         head_rows, biases, cube_row = self.constants
         return structs((*sizes, head_rows, self.cpu_grids, biases, cube_row, *dense_fields(tables)))
+
+    def bias_starts(self) -> list[int]:
+        """Where each head's planes begin in the biases of ``constants``."""
+        return [sum(len(b) for b in self.biases[:k]) for k in range(self.num_heads)]
 
     def interval(self, k: int) -> float:
         """Factor of head k's softplus: what a sample of it stands for."""
