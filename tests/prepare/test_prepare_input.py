@@ -24,7 +24,7 @@ from mmpi_ns.prepare.images import (
     sharpness,
 )
 from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.poses import make_cameras, opencv_intrinsics, parse_camera
+from mmpi_ns.prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.utils.errors import InputError
 
@@ -192,12 +192,13 @@ def test_focal_length_comes_from_the_option_then_exif_then_a_guess():
         assert camera.mean_focal_length() == expected
 
 
-def test_given_camera_comes_back_from_colmaps():
-    given = parse_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
+def test_given_camera_comes_back_from_colmaps(tmp_path):
+    given = opencv_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
     (camera,) = make_cameras([Photo("a", 100, 50)], "auto", {"a": given}, None, "auto")[1]
     assert opencv_intrinsics(camera) == ([90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004], False)
-    with pytest.raises(InputError, match="--camera takes"):
-        parse_camera((1.0, 2.0), fisheye=False)
+    for numbers, says in (((1.0, 2.0), "--camera takes"), ((-1.0, 2.0, 3.0), "must be positive")):
+        with pytest.raises(InputError, match=says):
+            prepare(Settings(tmp_path, tmp_path / "scene", camera=numbers))
 
 
 def chain(count, loop=None):
