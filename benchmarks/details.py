@@ -96,7 +96,8 @@ def details_of_run(pipeline: Any, config: Path) -> tuple[details.Details, float]
         cameras = details.moved_cameras(training.cameras.to(model.device), model.camera_optimizer)
         image_of, render = partial(image_and_mask, training), model.get_outputs_for_camera_ray_bundle
         print(details.write_details(folder, step, cameras, model.exposures.factors, image_of, render))
-        _, kept = details.read_details(folder)
+        kept = details.details_of(folder, step)
+    assert kept is not None
     return kept, clock() - start
 
 

@@ -18,7 +18,7 @@ from captures import Array, Truth, catalogue
 from lab import not_run
 from report import Bench, Report, Row, commit, page, table
 
-from mmpi_ns.prepare.adjustment import degrees_between, nearest_rotation, rotation_between
+from mmpi_ns.prepare.adjustment import degrees_between, nearest_rotation
 from mmpi_ns.prepare.pipeline import WORK
 from mmpi_ns.scripts.command import run
 
@@ -128,7 +128,7 @@ def pose_errors(centers: Array, rotations: Array, truth: Truth, kept: list[int])
     """
     scale, rotation, shift = similarity_of_centers(centers, truth.centers[kept])
     off = np.linalg.norm(scale * centers @ rotation.T + shift - truth.centers[kept], axis=-1)
-    best = rotation_between(rotations, truth.rotations[kept])
+    best = nearest_rotation(np.einsum("nij,nkj->ik", truth.rotations[kept], rotations))
     return off, degrees_between(best @ rotations, truth.rotations[kept])
 
 

@@ -31,7 +31,7 @@ class ScoreRow(Bench, Score):
     name = "score"
 
     def run(self) -> None:
-        found, means = self.score()
+        found, means = Score.main(self)
         report = Report(self)
         scene = f"{self.data.resolve().name} /{self.downscale_factor}"
         row: Row = {"method": self.method, "scene": scene, "given": self.given, "seconds": self.seconds}

@@ -1,4 +1,4 @@
-"""The model: plan -> field -> sampler -> compositing -> outputs."""
+"""The model: plan -> field -> march -> compositing -> outputs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from mmpi_ns.rendering.baked import BakedWindow, bake, why_not_baked
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
-from mmpi_ns.rendering.metrics import ImageMetrics, image_scores, pictures
+from mmpi_ns.rendering.metrics import ImageMetrics, pictures, psnr_and_ssim
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
     RenderingConfig,
@@ -374,9 +374,17 @@ class MMPIModel(Model):
     def scores_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics of an image, and pictures of it."""
-        observed = self.observed(batch).to(outputs["rgb"].device)
-        values = image_scores(self.metrics, outputs, observed, batch.get("distance"))
+        """Metrics of an image, "field_..." of the field without details, the mean "dropped_mass" and, where distances
+        are known, the relative error of rendered ones, median and share above a tenth; and pictures of it."""
+        observed, true = self.observed(batch).to(outputs["rgb"].device), batch.get("distance")
+        values = self.metrics(outputs["rgb"], observed)
+        if "field_rgb" in outputs:
+            values |= {f"field_{k}": value for k, value in psnr_and_ssim(outputs["field_rgb"], observed).items()}
+        values["dropped_mass"] = float(outputs["dropped_mass"].mean())
+        if true is not None and bool((true > 0).any()):
+            predicted, true = outputs["depth"], true.to(outputs["depth"])
+            error = (predicted[true > 0] / true[true > 0] - 1).abs()
+            values |= {"depth_error": float(error.median()), "depth_outliers": float((error > 0.1).float().mean())}
         return values, pictures(observed, outputs, len(self.progress.windows.names))
 
     def observed(self, batch: dict[str, Tensor]) -> Tensor:

@@ -12,7 +12,7 @@ from random_bricks import random_window, scene_of
 
 from mmpi_ns.export.details import stored_view
 from mmpi_ns.export.files import BakedScene
-from mmpi_ns.rendering.details import Details, read_details, write_details
+from mmpi_ns.rendering.details import Details, details_of, write_details
 
 HEIGHT, WIDTH = 36, 52
 LENSES = [[0.0] * 6, [0.2, -0.06, 0.02, 0.01, 0.03, -0.02], [0.05, -0.02, 0.0, 0.0, 0.0, 0.0]]
@@ -48,7 +48,9 @@ def details_for(scene: BakedScene, folder: Path) -> Details:
         return {"rgb": torch.full((HEIGHT, WIDTH, 3), 0.5), "depth": depth.view(HEIGHT, WIDTH, 1)}
 
     write_details(folder, 0, training_cameras(scene), torch.zeros(0, 3), image_of, outputs_of)
-    return read_details(folder)[1]
+    details = details_of(folder, 0)
+    assert details is not None
+    return details
 
 
 def with_details(scene: BakedScene, folder: Path, nearest: int = 3) -> BakedScene:

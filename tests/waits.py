@@ -7,6 +7,7 @@ import warnings
 import weakref
 from collections import Counter, defaultdict
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from training_runs import ready, trainer_config
 
 import mmpi_ns
 from mmpi_ns.capture.rays import CameraRays
-from mmpi_ns.training.memory import Work, step_bytes
+from mmpi_ns.training.memory import ALLOCATOR_SHARE, Work, reserved_bytes
 
 WAITING = {
     "_local_scalar_dense",
@@ -51,7 +52,7 @@ class Waits(TorchDispatchMode):
         self.live = self.peak = 0
         """Bytes of arrays that were made within and are there still, and the most that there were."""
         self.reserved = 0
-        """Bytes that are kept free for a step (``memory.step_bytes``)."""
+        """Bytes that are kept free for a step (``step_bytes``)."""
         self._paused = False
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
@@ -171,6 +172,12 @@ def counted_on_a_gpu():
     for w in said:
         if "synchronizing" in str(w.message):
             waits.found[f"{Path(w.filename).name}:{w.lineno}"] += 1
+
+
+def step_bytes(plan, work):
+    """What is reserved on a GPU for the arrays of a step alone."""
+    both = (reserved_bytes(plan, each, "cuda") for each in (work, replace(work, pixel_rays=0)))
+    return (next(both) - next(both)) / (1 + ALLOCATOR_SHARE)
 
 
 def waits_of_phases(scene, plan_file, folder, training, device, counted):

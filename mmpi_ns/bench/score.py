@@ -11,7 +11,6 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from mmpi_ns.capture.checks import check_transforms
-from mmpi_ns.capture.datamanager import check_there
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.pipeline import summary
@@ -47,14 +46,10 @@ class Score:
     lpips: Literal["vgg", "alex", "none"] = "vgg"
     """Network of LPIPS; it is left out where the weights are not available."""
 
-    def main(self) -> None:
-        self.score()
-
-    def score(self) -> tuple[Scores, dict[str, float]]:
+    def main(self) -> tuple[Scores, dict[str, float]]:
         """Scores, prints and returns name and metrics of each image, and the means."""
         counts = {name: Number(0, whole=True) for name in ("downscale_factor", "test_images")}
         check_options(self, counts, "--")
-        check_there(self.data)
         parser = NerfstudioDataParserConfig(data=self.data, downscale_factor=self.downscale_factor)
         check_transforms(parser, self.data, ("test",), opens=True)
         truths = MMPIDataset(parser.setup().get_dataparser_outputs(split="test"))

@@ -8,8 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,14 +18,12 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
-from PIL import Image
 
 from mmpi_ns.utils.errors import InputError, brief, looked_at
+from mmpi_ns.utils.files import opened
 from mmpi_ns.utils.host import command
 from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
-# Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
-UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
 FLOAT64_SAME = 1e-12
 """Cameras of a file closer together than this fraction of their distance from the origin count as one place."""
 ROTATION_SLACK = 0.01
@@ -100,16 +97,6 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     outside = [n for n in files if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
     if outside:
         say_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
-
-
-@contextmanager
-def opened(name: Path) -> Iterator[Image.Image]:
-    """An image file that is read within the block; InputError names it where that cannot be done."""
-    try:
-        with Image.open(name) as image:
-            yield image
-    except UNREADABLE as error:
-        raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.") from error
 
 
 def names_of_copies(folder: Path) -> str:

@@ -22,7 +22,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, opened, say_once
+from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
@@ -35,7 +35,8 @@ from mmpi_ns.capture.rays import CameraRays
 from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.utils.errors import InputError, looked_at, say
+from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.files import opened
 from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import generator
 from mmpi_ns.utils.values import check_options
@@ -331,12 +332,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return batch
 
 
-def check_there(data: Path) -> None:
-    """Raises InputError where there is neither a folder nor a file."""
-    if not data.exists():
-        raise InputError(f"There is no scene at {looked_at(data)}: check the path.")
-
-
 def load_observations(
     data: Path, downscale_factor: int | None = None, parser: Parser = "auto", moving: Path | None = None
 ) -> tuple[Observations, str]:
@@ -348,7 +343,7 @@ def load_observations(
         downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
         moving: file for a picture of what moves. None: neither movers nor depths of pixels are searched, which takes
-            minutes; tracks or a plane sweep take their place.
+            minutes; tracks or searched surfaces take their place.
     """
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()

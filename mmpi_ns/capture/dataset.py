@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from mmpi_ns.capture.checks import UNREADABLE, check_places, names_of_copies, opened, say_once
+from mmpi_ns.capture.checks import check_places, names_of_copies, say_once
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
 from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.files import UNREADABLE, opened
 from mmpi_ns.utils.host import transforms_changed
 
 SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
@@ -209,8 +210,15 @@ class LocalOrigin:
             place = ", ".join(f"{x:.10g}" for x in self.place)
             say_once(f"{source} has map coordinates: they are taken from ({place}).")
 
-    def tell(self, outputs: DataparserOutputs) -> DataparserOutputs:
-        """Gives the transform from the capture's own coordinates, in float64, for the points of a model."""
+    def tell(self, outputs: DataparserOutputs, factor: int | None) -> DataparserOutputs:
+        """The parser's outputs with the transform from the capture's own coordinates, in float64, for the points of a
+        model, and with cameras that fit downscaled copies: the parser divides by the factor, whatever was rounded."""
+        for i, file in enumerate(outputs.image_filenames if factor is not None and factor > 1 else ()):
+            with suppress(InputError):  # is named when it is read
+                original, _, scale = whole_of(Path(file), size_of(Path(file)))
+                if original != file:
+                    for name, ratio in zip(("fx", "fy", "cx", "cy"), np.tile(factor / scale, 2), strict=True):
+                        getattr(outputs.cameras, name)[i] *= ratio
         if not self.taken:
             return outputs
         transform = outputs.dataparser_transform.double().numpy().copy()
@@ -219,19 +227,6 @@ class LocalOrigin:
         to_file = np.linalg.solve(applied[:, :3], self.applied - self.place)
         transform[:, 3] += transform[:, :3] @ to_file
         return MapOutputs(**{**vars(outputs), "dataparser_transform": torch.from_numpy(transform)})
-
-
-def with_cameras_of_copies(outputs: DataparserOutputs, factor: int | None) -> DataparserOutputs:
-    """Parser outputs whose cameras fit downscaled copies; the parser divides by the factor, whatever was rounded."""
-    if factor is not None and factor > 1:
-        cameras = outputs.cameras
-        for i, file in enumerate(outputs.image_filenames):
-            with suppress(InputError):  # is named when it is read
-                original, _, scale = whole_of(Path(file), size_of(Path(file)))
-                if original != file:
-                    for name, ratio in zip(("fx", "fy", "cx", "cy"), np.tile(factor / scale, 2), strict=True):
-                        getattr(cameras, name)[i] *= ratio
-    return outputs
 
 
 class LocalNerfstudio(Nerfstudio):
@@ -251,7 +246,7 @@ class LocalNerfstudio(Nerfstudio):
 
         with transforms_changed(nerfstudio_dataparser, subtract):
             outputs = super()._generate_dataparser_outputs(split)
-        return with_cameras_of_copies(self._origin.tell(outputs), self.downscale_factor)
+        return self._origin.tell(outputs, self.downscale_factor)
 
     def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
         origin = self._origin.place if self._origin.taken else 0.0
@@ -292,7 +287,7 @@ class LocalColmap(ColmapDataParser):
         if not model.is_dir():
             raise InputError(f"There is no COLMAP model at {model}: check --data, and --colmap-path after colmap.")
         outputs = super()._generate_dataparser_outputs(split, **kwargs)
-        return with_cameras_of_copies(self._origin.tell(outputs), self._downscale_factor)
+        return self._origin.tell(outputs, self._downscale_factor)
 
     def _setup_downscale_factor(
         self, image_filenames: list[Path], mask_filenames: list[Path], depth_filenames: list[Path]

@@ -37,7 +37,7 @@ from mmpi_ns.utils.parallel import in_order, num_threads
 
 Codes = NDArray[np.int16]
 
-VERSION = 16
+VERSION = 17
 """Version of the algorithm: cached depths of another version are recomputed."""
 FINER, LONGEST = 2.0, 1600
 """Images are matched at this multiple of the training size, if the originals are available, and their longer side has
@@ -270,7 +270,8 @@ def of_cells(observations: Observations, depths: KnownDepth, dataset: MMPIDatase
     """The observations that placement weighs: of each image cell the pixel with the most certain depth.
 
     Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then draw MPIs and texels
-    to the parts of the images that an SfM model or a cloud is densest in. Without depths nothing changes.
+    to the parts of the images that an SfM model or a cloud is densest in. Points of searched surfaces are rougher and
+    leave. Without depths nothing changes.
     """
 
     def points_of(i: int) -> NDArray[np.float64]:
@@ -295,9 +296,9 @@ def of_cells(observations: Observations, depths: KnownDepth, dataset: MMPIDatase
     cells = np.concatenate(points)
     if not len(cells):
         return observations
-    if len(observations.seen_by) > MOST_KEYPOINTS * len(cells):
-        nothing = observations.with_keypoints(np.zeros(len(observations.seen_by), np.bool_))
-        observations = replace(nothing, points=cells[:0])
+    kept = len(observations.seen_at)
+    kept = 0 if kept > MOST_KEYPOINTS * len(cells) else kept
+    observations = observations.with_keypoints(np.arange(len(observations.seen_by)) < kept)
     return replace(
         observations,
         points=np.concatenate([observations.points, cells]),

@@ -25,11 +25,13 @@ from scipy.ndimage import minimum_filter
 from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.patches import search_surfaces
 from mmpi_ns.capture.rays import lens_directions
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model, numbers_in_model
 from mmpi_ns.capture.tracks import SAME_PLACE, PosedImages, at_full_size, triangulate
-from mmpi_ns.capture.views import Map, project
-from mmpi_ns.placement.observations import Observations, add_swept_points
+from mmpi_ns.capture.views import Map, load_view, pixel_grid, project
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, quoted
 
 Array = NDArray[np.float64]
@@ -40,10 +42,17 @@ POSES_OFF = 0.5
 """Error of the poses, in training pixels, above which it is reported."""
 TRACKS_VERSION = 3
 """Version of the algorithm: cached tracks of another version are recomputed."""
-THUMBNAIL = 128
-"""Maximum pixels along a side of the gray images for the plane sweep, box-filtered."""
 ENOUGH_KEYPOINTS = 20
-"""Average number of keypoints in an image above which no plane sweep is needed."""
+"""Average number of keypoints in an image above which no surfaces need to be searched."""
+SEARCHED, SEARCHED_SIDE = 16, 220
+"""Views whose surfaces are searched, evenly spread over the capture, and pixels of their longer side."""
+SEARCH_NEAR, SEARCH_ANGLE = (4, 8), 30.0
+"""Nearest views that such a view is compared with, and which count as seeing its points; the largest angle in degrees
+between their directions."""
+SEARCH_ERROR = 0.5
+"""Largest relative error of a point: what is so far that it hardly moves must not be left out."""
+POINTS_PER_VIEW = 400
+"""Points on the surfaces of such a view, about."""
 CELLS, BEHIND = 48, 1.15
 """Cells of a coarse depth image along the longer side; a point farther away than the nearest one around it by this
 factor is hidden."""
@@ -94,7 +103,7 @@ def observe(
 
 
 def _find_points(observations: Observations, dataset: MMPIDataset, triangulates: bool) -> Observations:
-    """Points of a scene without tracks: triangulated, and from a plane sweep if triangulation finds too few."""
+    """Points of a scene without tracks: triangulated, and on searched surfaces if triangulation finds too few."""
     images = posed_images(observations, dataset)
     if images is None:
         CONSOLE.print("Cameras that are neither perspective nor fisheye: no features are matched.")
@@ -113,17 +122,40 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
         CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
         observations = with_tracks(observations, model)
         tell_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
-    if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
-        CONSOLE.print("Few or no tracks: a quick plane sweep locates the content.")
-        thumbnails = []
-        for i in range(len(dataset)):
-            image = dataset.get_data(i, image_type="uint8")["image"][..., :3].float().mean(-1) / 255
-            scale = max(1.0, max(image.shape) / THUMBNAIL)
-            size = [max(8, round(n / scale)) for n in image.shape]
-            small = torch.nn.functional.interpolate(image[None, None], size=size, mode="area")
-            thumbnails.append(small[0, 0].double().numpy())
-        observations = add_swept_points(observations, thumbnails)
+    if images is not None and len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
+        CONSOLE.print("Few or no tracks: a quick search for surfaces locates the content.")
+        observations = with_surfaces(observations, at_full_size(images))
     return observations
+
+
+def with_surfaces(observations: Observations, images: PosedImages) -> Observations:
+    """The observations with points on surfaces of some views, which are searched at a low resolution (``patches.py``).
+    Points, each seen by its view and every near one it falls on, follow earlier ones."""
+    poses, count = observations.camera_to_worlds, len(images.files)
+    points, seen_by, seen_point = [observations.points], [observations.seen_by], [observations.seen_point]
+    for i in np.unique(np.linspace(0, count - 1, min(SEARCHED, count)).round().astype(int)).tolist():
+        near = nearest_views(poses, i, SEARCH_NEAR[1], SEARCH_ANGLE)
+        view, *others = (load_view(images, j, SEARCHED_SIDE) for j in (i, *near[: SEARCH_NEAR[0]]))
+        surfaces = search_surfaces(view, others, np.zeros(view.gray.shape, np.float32), SEARCH_ERROR)
+        if surfaces is None:
+            continue
+        where = np.nonzero(surfaces.inverse)
+        where = tuple(at[:: max(1, len(at) // POINTS_PER_VIEW)] for at in where)
+        depth, (x, y) = (
+            1 / surfaces.inverse[where].astype(np.float64),
+            (at[where] for at in pixel_grid(view.gray.shape)),
+        )
+        fx, fy, cx, cy = view.pinhole
+        local = np.stack([(x - cx) / fx, -(y - cy) / fy, -np.ones_like(x)], -1) * depth[:, None]
+        places = local @ poses[i, :, :3].T + poses[i, :, 3]
+        cameras = np.repeat(np.array([i, *near]), len(places))
+        at, ahead = observations.project(cameras, np.tile(places, (1 + len(near), 1)))
+        seen = np.nonzero(ahead & ((at >= 0) & (at < observations.sizes[cameras])).all(-1))[0]
+        seen_by.append(cameras[seen])
+        seen_point.append(sum(map(len, points)) + seen % max(1, len(places)))
+        points.append(places)
+    joined = (np.concatenate(parts) for parts in (points, seen_by, seen_point))
+    return replace(observations, **dict(zip(("points", "seen_by", "seen_point"), joined, strict=True)))
 
 
 def tell_poses(off: float, image: Path) -> None:

@@ -29,6 +29,9 @@ LEVELS = ((4, 6, 1.0), (2, 4, 0.5), (1, 3, 0.3))
 of the inverse depth, and parts of the unit normal."""
 RANDOM, BEYOND = 8, 4.0
 """Random planes for each pixel of the smallest size, and how far they reach beyond the nearest and farthest points."""
+FASTEST, SLOWEST = 0.35, 1.0
+"""Where no point is known they reach from a motion by this part of the width, in the nearest neighbour, to one by so
+many pixels, in the farthest."""
 STRIDE = 2
 """Pixels between the pixels of a patch."""
 MIN_ALIKE = 0.7
@@ -76,12 +79,15 @@ class Surfaces:
         return np.where(is_known, inverse, 0), np.where(is_known, error, 0)
 
 
-def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces | None:
-    """Planes through the pixels of a view at a low resolution; None if it is too small, or nothing is known of its
-    depths. ``rough`` are inverse depths to start from, of which the range matters most. [H, W]"""
+def search_surfaces(
+    view: View, others: Sequence[View], rough: Map, max_relative: float = MAX_RELATIVE
+) -> Surfaces | None:
+    """Planes through the pixels of a view at a low resolution; None if it is too small, or has no parallax to others.
+    ``rough`` are inverse depths to start from, of which the range matters most, 0 where unknown. [H, W]"""
     height, width = view.gray.shape
     smallest = max(1.0, (height * width / PIXELS) ** 0.5)
-    if not others or min(height, width) < LEAST_SIDE * LEVELS[0][0] * smallest or not (rough > 0).any():
+    apart = np.array([np.linalg.norm(other.pose[:, 3] - view.pose[:, 3]) for other in others])
+    if not apart.any() or min(height, width) < LEAST_SIDE * LEVELS[0][0] * smallest:
         return None
     random, patches, small = torch.Generator().manual_seed(0), None, view
     for divisor, rounds, change in LEVELS:
@@ -97,7 +103,11 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
             start = torch.zeros(*shape, 3)
             start[..., 0] = torch.from_numpy(cv2.resize(rough, shape[::-1]))
             # And planes of any depth in the range of rough ones, facing the camera.
-            near, far = np.percentile(rough[rough > 0], [99, 1]) * [BEYOND, 1 / BEYOND]
+            if (rough > 0).any():
+                near, far = np.percentile(rough[rough > 0], [99, 1]) * [BEYOND, 1 / BEYOND]
+            else:  # on a walk all but the nearest neighbours have long turned away from what is near
+                near = FASTEST * width / view.pinhole[0] / max(apart.min(), 0.1 * apart.max())
+                far = SLOWEST * smallest / view.pinhole[0] / apart.max()
             size, (fx, fy, cx, cy) = (RANDOM, *shape), pinhole
             q = far * (near / far) ** torch.rand(size, generator=random)
             ahead, turn = torch.rand(size, generator=random), 2 * np.pi * torch.rand(size, generator=random)
@@ -117,7 +127,7 @@ def search_surfaces(view: View, others: Sequence[View], rough: Map) -> Surfaces 
             offset = OFFSETS[n % len(OFFSETS)]
             patches = spread_planes(gray, patches, changes, pinhole, compared, STRIDE, offset)
     assert patches is not None
-    return _certain(small, [other.reduced(smallest) for other in others], patches)
+    return _certain(small, [other.reduced(smallest) for other in others], patches, max_relative)
 
 
 def _resized(planes: Tensor, shape: tuple[int, ...]) -> Tensor:
@@ -132,7 +142,7 @@ def _resized(planes: Tensor, shape: tuple[int, ...]) -> Tensor:
     return torch.stack([q, across * width, along * height], -1)
 
 
-def _certain(view: View, others: Sequence[View], patches: Patches) -> Surfaces:
+def _certain(view: View, others: Sequence[View], patches: Patches, max_relative: float) -> Surfaces:
     """The planes that are alike, close to those around them, and precise enough."""
     planes = patches.planes.numpy()
     inverse: Map = np.ascontiguousarray(planes[..., 0])
@@ -150,7 +160,7 @@ def _certain(view: View, others: Sequence[View], patches: Patches) -> Surfaces:
         best = np.maximum(best, moved)
     error = NOISE / np.maximum(np.where(second > 0, second, best), 1e-12)
     middle = cv2.medianBlur(inverse, 5)
-    kept = (patches.alike.numpy() > MIN_ALIKE) & view.inside & (error < MAX_RELATIVE * inverse)
+    kept = (patches.alike.numpy() > MIN_ALIKE) & view.inside & (error < max_relative * inverse)
     kept &= (inverse < SAME * middle) & (middle < SAME * inverse)
     # OpenCV's filter takes integers; one step of depth is 16.
     octaves = np.log(np.maximum(inverse, 1e-30)) / np.log(SAME)

@@ -22,7 +22,8 @@ from PIL import Image
 from mmpi_ns.capture import sfm
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 from mmpi_ns.scene.near_views import nearest_views
-from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.files import opened
 
 NEIGHBOURS = 8
 """Maximum number of images that each image is matched with: the nearest with a similar viewing direction."""
@@ -80,13 +81,8 @@ def original_of(file: Path) -> tuple[Path, int]:
 
 def size_of(file: Path) -> NDArray[np.float64]:
     """Width and height of an image file. Raises InputError if it cannot be read (names it)."""
-    try:
-        with Image.open(file) as image:
-            return np.array(image.size, np.float64)
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"Training image {file} cannot be read ({brief(error)}): repair it or remove its frame."
-        ) from error
+    with opened(file) as image:
+        return np.array(image.size, np.float64)
 
 
 def shown_size(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -186,7 +182,8 @@ def triangulate(images: PosedImages) -> SfmModel:
             sfm.find_features(database, work, names, options)
             for file, features in zip(images.files, sfm.count_features(database), strict=True):
                 if features is None:
-                    raise InputError(f"Training image {file} cannot be read: repair or remove it.")
+                    why = "by COLMAP"
+                    raise InputError(f"Image {file} cannot be read ({why}): repair it or leave it out.")
             if pairs:
                 sfm.match_pairs(database, pairs, guided=guided, least=least)
                 error = _epipolar_error(database, model)

@@ -15,42 +15,34 @@ from mmpi_ns.utils.files import write_atomically
 PAGE = Path(__file__).parent / "page"
 
 
-def write_page(folder: Path) -> Path:
-    """Writes ``index.html`` beside a baked scene."""
-    read_header(folder)
-    path = folder / "index.html"
-    html = _html("", "")
-    write_atomically(path, lambda unfinished: unfinished.write_text(html, encoding="utf-8"))
-    return path
-
-
-def write_single_file(folder: Path, path: Path) -> None:
-    """Writes one HTML file that contains a baked scene and opens by a double click.
+def write_page(folder: Path, single_file: Path | None = None) -> Path:
+    """Writes the page of a baked scene: ``index.html`` beside it, or one file that contains it and opens by a double
+    click.
 
     Args:
         folder: of the baked scene.
-        path: the file to write.
+        single_file: the one file to write.
+
+    Returns:
+        The file that was written.
 
     Raises:
         ValueError: the scene is missing or of another version.
         OSError: the disk is full or cannot be written.
     """
-    header = read_header(folder)
-    block = '<script type="{}" id="{}">{}</script>'
-    text = (folder / HEADER).read_text(encoding="utf-8").replace("<", "\\u003c")
-    first, rest, last = [block.format("application/json", HEADER, text)], [], []
-    for row in header["windows"]:
-        data, kind = (folder / row["file"]).read_bytes(), "application/octet-stream"
-        ends_of_parts = (0, row["first_bytes"], row["bricks_bytes"], row["bytes"])
-        parts = [base64.b64encode(data[begin:end]).decode() for begin, end in pairwise(ends_of_parts)]
-        first.append(block.format(kind, row["file"], parts[0]))
-        rest.append(block.format(kind, f"{row['file']}.rest", parts[1]))
-        last.append(block.format(kind, f"{row['file']}.details", parts[2]))
-    html = _html("\n".join(first), "\n".join(rest + last))  # the code between them runs before the rest is there
-    write_atomically(path, lambda unfinished: unfinished.write_text(html, encoding="utf-8"))
-
-
-def _html(first: str, rest: str) -> str:
+    header, path = read_header(folder), single_file or folder / "index.html"
+    first, rest, last = [], [], []
+    if single_file is not None:
+        block = '<script type="{}" id="{}">{}</script>'
+        text = (folder / HEADER).read_text(encoding="utf-8").replace("<", "\\u003c")
+        first.append(block.format("application/json", HEADER, text))
+        for row in header["windows"]:
+            data, kind = (folder / row["file"]).read_bytes(), "application/octet-stream"
+            ends_of_parts = (0, row["first_bytes"], row["bricks_bytes"], row["bytes"])
+            parts = [base64.b64encode(data[begin:end]).decode() for begin, end in pairwise(ends_of_parts)]
+            first.append(block.format(kind, row["file"], parts[0]))
+            rest.append(block.format(kind, f"{row['file']}.rest", parts[1]))
+            last.append(block.format(kind, f"{row['file']}.details", parts[2]))
     march, details, page, *scripts = (
         (PAGE / name).read_text(encoding="utf-8")
         for name in ("march.glsl", "details.glsl", "index.html", "scene.js", "details.js", "page.js")
@@ -58,4 +50,7 @@ def _html(first: str, rest: str) -> str:
     shaders = {"MARCH": march.replace("ENDS", ends.TEXT, 1), "DETAILS": WEIGHTS + details}
     constants = [f"const {name} = `{text}`;" for name, text in shaders.items()] + [f"const MAX_ANGLE = {MAX_ANGLE};"]
     page = page.replace("/*code*/", "\n".join([*constants, *scripts]))
-    return page.replace("<!--data-->", first).replace("<!--rest-->", rest)
+    # The code between the data runs before the rest is there.
+    page = page.replace("<!--data-->", "\n".join(first)).replace("<!--rest-->", "\n".join(rest + last))
+    write_atomically(path, lambda unfinished: unfinished.write_text(page, encoding="utf-8"))
+    return path

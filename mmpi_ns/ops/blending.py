@@ -12,7 +12,7 @@ from torch import Tensor
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.scene.geometry import LocalRays, local_to_ndc
+from mmpi_ns.scene.geometry import Frames, LocalRays, local_to_ndc
 
 
 def blend_shares(
@@ -96,7 +96,8 @@ def log_shares(
         if j < len(layout.mpis):
             origins, directions = (x[:, j].index_select(0, rays) for x in (local.local_origins, local.local_directions))
             point = origins * inverse_t[:, None] + directions
-            ndc, inside = (x[:, 0] for x in local_to_ndc(point[:, None], inverse_t[:, None], layout.frames.one(j)))
+            frame = Frames(*(x[j : j + 1] for x in vars(layout.frames).values()))
+            ndc, inside = (x[:, 0] for x in local_to_ndc(point[:, None], inverse_t[:, None], frame))
         else:
             assert layout.cube is not None
             origins, directions = (x.index_select(0, rays) for x in (local.origins, local.directions))

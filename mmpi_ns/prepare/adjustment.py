@@ -290,11 +290,6 @@ def degrees_between(first: Array, second: Array) -> Array:
     return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
 
 
-def rotation_between(source: Array, target: Array) -> Array:
-    """The rotation [3, 3] that takes rotations [N, 3, 3] nearest to others: it turns all cameras of a track alike."""
-    return nearest_rotation(np.einsum("nij,nkj->ik", target, source))
-
-
 def nearest_rotation(matrix: Array) -> Array:
     """The rotation with the largest product with a matrix. [3, 3]"""
     u, _, vt = np.linalg.svd(matrix)

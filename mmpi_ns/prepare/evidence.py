@@ -21,7 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.sfm import MIN_INLIERS, epipolar_distances, verified_matches
-from mmpi_ns.prepare.adjustment import Array, camera_poses, degrees_between, rotation_between, similarity_between
+from mmpi_ns.prepare.adjustment import Array, camera_poses, degrees_between, nearest_rotation, similarity_between
 
 Places = NDArray[np.int64]
 
@@ -255,7 +255,8 @@ def agreement(first: Witness, second: Witness) -> Agreement | None:
     similarity = similarity_between(a, b).matrix()
     moved = a[:, :3, 3] @ similarity[:, :3].T + similarity[:, 3]
     extent = max(float(np.linalg.norm(np.ptp(b[:, :3, 3], axis=0))), 1e-12)
-    turns = degrees_between(rotation_between(a[:, :3, :3], b[:, :3, :3]) @ a[:, :3, :3], b[:, :3, :3])
+    a_turns, b_turns = a[:, :3, :3], b[:, :3, :3]
+    turns = degrees_between(nearest_rotation(np.einsum("nij,nkj->ik", b_turns, a_turns)) @ a_turns, b_turns)
     centers = np.linalg.norm(moved - b[:, :3, 3], axis=-1) / extent
     limits = ((centers, APART), (turns, TURNED))
     is_same = all(values.mean() <= mean and values.max() <= largest for values, (mean, largest) in limits)

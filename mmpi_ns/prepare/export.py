@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,14 +36,27 @@ class Split:
     says: str
 
 
-def split_by_count(names: Sequence[str], test_every: int | None, train_every: int | None) -> Split:
-    """Every n-th image tests, or trains, from the middle of the first n on. Raises InputError if none is left."""
+def split_images(
+    names: Sequence[str],
+    test_every: int | None = None,
+    train_every: int | None = None,
+    lists: Mapping[str, Any] | None = None,
+    source: str = "",
+) -> Split:
+    """Every n-th image tests, or trains, from the middle of the first n on; or as the lists of another scene's
+    transforms.json (``source``) say, and images that they do not name are left out of both. Raises InputError if no
+    image is left to train or to test."""
+    if lists is not None:
+        sides = []
+        for key in ("train_filenames", "test_filenames"):
+            listed = {Path(str(n)).name for n in lists[key]}
+            sides.append(tuple(n for n in names if n in listed))
+            if not sides[-1]:
+                raise InputError(f"None of the {len(listed)} {key} of {source} is among the registered images.")
+        return Split(sides[0], sides[1], f"as listed in {source}")
     if test_every == 0:
-        return Split(
-            tuple(names),
-            tuple(names),
-            "every image is used for training and testing (--test-every 0): scores are meaningless",
-        )
+        says = "every image is used for training and testing (--test-every 0): scores are meaningless"
+        return Split(tuple(names), tuple(names), says)
     every = train_every or test_every or min(8, len(names))
     picked = {n for i, n in enumerate(names) if i % every == every // 2}
     rest = {n for n in names if n not in picked}
@@ -53,18 +66,6 @@ def split_by_count(names: Sequence[str], test_every: int | None, train_every: in
     role = "trains, the others test" if train_every else "tests, the others train"
     says = f"one image in {every} {role}, from the {every // 2 + 1}. on"
     return Split(tuple(n for n in names if n in train), tuple(n for n in names if n in test), says)
-
-
-def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Split:
-    """The split of another scene's transforms.json; images it does not list are left out of both. Raises InputError
-    if the lists name none of the images."""
-    sides = []
-    for key in ("train_filenames", "test_filenames"):
-        listed = {Path(str(n)).name for n in lists[key]}
-        sides.append(tuple(n for n in names if n in listed))
-        if not sides[-1]:
-            raise InputError(f"None of the {len(listed)} {key} of {source} is among the registered images.")
-    return Split(sides[0], sides[1], f"as listed in {source}")
 
 
 def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes: dict[str, Any]) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps
 
 from mmpi_ns.capture.exif import kept_tags, positive_number
 from mmpi_ns.utils.errors import InputError, progress, say
-from mmpi_ns.utils.files import whole, write_text
+from mmpi_ns.utils.files import opened, whole, write_text
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 HEIF = (".heic", ".heif")
@@ -114,7 +114,9 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
             used.add(stem.lower())
             kind = file.suffix.lower()
             name = stem + (file.suffix if kind in (".jpg", ".jpeg", ".png") else ".jpg" if kind in HEIF else ".png")
-            image, copy = open_image(file), target / "images" / name
+            copy = target / "images" / name
+            with opened(file) as image:
+                image.load()
             exif = image.getexif()
             is_turned = exif.get(ExifTags.Base.Orientation, 1) not in (0, 1)
             size = ImageOps.exif_transpose(image).size if is_turned else image.size
@@ -144,16 +146,6 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
     return photos
 
 
-def open_image(path: Path) -> Image.Image:
-    """An image, decoded. Raises InputError naming the file if it cannot be read."""
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path} cannot be read ({error}): repair or remove it.") from error
-
-
 def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     """Writes a mask for each image to ``target/NAME.png``: white is used, black (zero) is left out.
 
@@ -173,7 +165,8 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
         mask = Image.new("L", (photo.width, photo.height), 255)
         if source is not None:
             count += 1
-            mask = ImageOps.exif_transpose(open_image(source)).convert("L").point(lambda v: 255 if v else 0)
+            with opened(source) as image:
+                mask = ImageOps.exif_transpose(image).convert("L").point(lambda v: 255 if v else 0)
             if mask.size != (photo.width, photo.height):
                 raise InputError(
                     f"Mask {source} is {mask.size[0]}x{mask.size[1]}, its image {photo.name} "

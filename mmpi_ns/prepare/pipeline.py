@@ -25,7 +25,7 @@ from mmpi_ns.prepare import checks, export, features, images
 from mmpi_ns.prepare.adjustment import camera_poses, choose_frame, focal_interval, map_known_poses
 from mmpi_ns.prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_ns.prepare.mapping import Task, map_and_judge
-from mmpi_ns.prepare.poses import make_cameras, parse_camera, read_poses
+from mmpi_ns.prepare.poses import GIVEN_COUNTS, make_cameras, opencv_camera, read_poses
 from mmpi_ns.prepare.settings import RANGES, Settings, read_lists
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.utils.errors import FULL, InputError, looked_at, progress, quoted, say
@@ -140,7 +140,8 @@ class Preparation:
         self._split([p.name for p in self.photos])  # refuse a split that is impossible before the work
         lenses = self.known_poses.intrinsics if self.known_poses else {}
         if s.camera is not None:
-            lenses = dict.fromkeys((p.name for p in self.photos), parse_camera(s.camera, s.lens == "fisheye"))
+            numbers = (s.camera[0], *s.camera) if len(s.camera) == 3 else s.camera
+            lenses = dict.fromkeys((p.name for p in self.photos), opencv_camera(numbers, s.lens == "fisheye"))
         elif s.focal is not None:
             lenses = {}
         self.numbers, self.cameras = make_cameras(self.photos, s.intrinsics, lenses, s.focal, s.lens)
@@ -256,10 +257,10 @@ class Preparation:
     def _split(self, names: Sequence[str]) -> export.Split:
         s = self.settings
         if s.split_from is not None:
-            return export.split_from(read_lists(s.split_from), names, s.split_from.name)
+            return export.split_images(names, lists=read_lists(s.split_from), source=s.split_from.name)
         if self.known_poses is not None and self.known_poses.split and s.test_every is None and s.train_every is None:
-            return export.split_from(self.known_poses.split, names, f"{s.poses}")
-        return export.split_by_count(names, s.test_every, s.train_every)
+            return export.split_images(names, lists=self.known_poses.split, source=f"{s.poses}")
+        return export.split_images(names, s.test_every, s.train_every)
 
     def _check(
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split, built: Path
@@ -351,8 +352,12 @@ def prepare(s: Settings) -> Verdict:
     load_pycolmap()  # in a version that is new enough
     check_options(s, {name: number for name, number in RANGES.items() if getattr(s, name) is not None}, "--")
     every, threads = (s.test_every, s.train_every), s.threads
-    source, scene = s.input.resolve(), s.scene.resolve()
+    source, scene, kinds = s.input.resolve(), s.scene.resolve(), " or ".join(GIVEN_COUNTS.values())
+    camera = (1.0,) * 4 if s.camera is None else s.camera
+    focals = camera[: 1 if len(camera) == 3 else 2]
     faults = {
+        f"--camera takes {kinds}, not {len(camera)} numbers.": len(camera) not in GIVEN_COUNTS,
+        "--camera: focal lengths must be positive, in pixels.": min(focals, default=1) <= 0,
         "--focal and --camera both give a focal length: leave one out.": None not in (s.focal, s.camera),
         "--test-every and --train-every contradict each other: leave one out.": None not in every,
         f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.": (s.test_every or 2) < 2,

@@ -37,17 +37,6 @@ def opencv_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:
     return pycolmap.Camera(model=model, params=[*values, 0.0, 0.0, 0.0, 0.0][: 4 if model == "PINHOLE" else 8])
 
 
-def parse_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:
-    """The camera of ``--camera``. Raises InputError if the numbers fit none or a focal length is not positive."""
-    if len(values) not in GIVEN_COUNTS:
-        raise InputError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
-    if len(values) == 3:
-        values = (values[0], *values)
-    if min(values[:2]) <= 0:
-        raise InputError("--camera: focal lengths must be positive, in pixels.")
-    return opencv_camera(values, fisheye)
-
-
 def make_cameras(
     photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, pycolmap.Camera], focal: float | None, lens: Lens
 ) -> tuple[list[int], list[pycolmap.Camera]]:

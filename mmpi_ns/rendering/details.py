@@ -59,30 +59,6 @@ class DetailView:
     camera: Float[Tensor, "24"]
 
 
-def blended_details(
-    views: list[DetailView],
-    shares: list[float],
-    origins: Float[Tensor, "P 3"],
-    directions: Float[Tensor, "P 3"],
-    depth: Float[Tensor, "P 1"],
-) -> Float[Tensor, "P 3"]:
-    """What to add to the radiance of rays: the weighted mean of the differences that training images show.
-
-    Args:
-        views: the training images.
-        shares: factor on the weights of each.
-        origins: of the rays.
-        directions: of the rays, unit length.
-        depth: distances of their surfaces along the rays; infinity is allowed.
-    """
-    total, weight, inverse = torch.zeros_like(origins), torch.full_like(depth, LEAST_WEIGHT), 1 / depth
-    for view, share in zip(views, shares, strict=True):
-        difference, seen = seen_details(origins, directions, inverse, view.image, view.camera)
-        total += share * seen * difference
-        weight += share * seen
-    return STRENGTH * total / weight
-
-
 class Details:
     """Training images with what the field lacks in them, read as images need them.
 
@@ -118,10 +94,16 @@ class Details:
         distances = np.linalg.norm(self._poses[chosen, :, 3] - pose[0, :, 3], axis=-1)
         limit = distances[-1] if len(chosen) > nearest and distances[-1] > 0 else np.inf
         chosen, shares = chosen[:nearest], (1 - (distances / limit) ** 2)[:nearest].tolist()
-        views = [self.view(i, origins.device) for i in chosen]
-        rays = zip(*(x.split(PART) for x in (origins, directions, outputs["depth"].reshape(-1, 1))), strict=True)
-        detail = torch.cat([blended_details(views, shares, *part) for part in rays]).view(bundle.origins.shape)
-        detail = detail * outputs["accumulation"]
+        views, details = [self.view(i, origins.device) for i in chosen], []
+        columns = (origins, directions, 1 / outputs["depth"].reshape(-1, 1))
+        for rays in zip(*(x.split(PART) for x in columns), strict=True):  # the weighted mean of what the views show
+            total, weight = torch.zeros_like(rays[0]), torch.full_like(rays[2], LEAST_WEIGHT)
+            for view, share in zip(views, shares, strict=True):
+                difference, seen = seen_details(*rays, view.image, view.camera)
+                total += share * seen * difference
+                weight += share * seen
+            details.append(STRENGTH * total / weight)
+        detail = torch.cat(details).view(bundle.origins.shape) * outputs["accumulation"]
         rgb = (outputs["rgb"] + (detail if exposure is None else exposure * detail)).clamp(0, 1)
         shown = outputs | {"rgb": rgb, "field_rgb": outputs["rgb"]}
         if "radiance" in outputs:
@@ -129,16 +111,19 @@ class Details:
         return shown
 
 
-def read_details(folder: Path) -> tuple[int, Details]:
-    """What ``write_details`` has written, and the step of its checkpoint. Raises InputError if it is damaged."""
-    step, cameras = _load(folder / CAMERAS_FILE, "step", "cameras")
+def details_of(folder: Path, step: int) -> Details | None:
+    """What ``write_details`` has written for the checkpoint of a step; None if there is nothing, or it is another's.
+    Raises InputError if it is damaged."""
+    if not (folder / CAMERAS_FILE).is_file():
+        return None
+    kept_at, cameras = _load(folder / CAMERAS_FILE, "step", "cameras")
 
     def read(i: int, device: torch.device) -> DetailView:
         difference, inverse = (x.to(device) for x in _load(folder / f"{i:05d}.npz", "difference", "inverse"))
         image = torch.cat([difference.float() * (LARGEST / LEVELS), inverse.float()[..., None]], -1)
         return DetailView(image, cameras[i].to(device))
 
-    return int(step), Details(cameras, read)
+    return Details(cameras, read) if int(kept_at) == step else None
 
 
 def _load(path: Path, *names: str) -> list[Tensor]:
@@ -151,13 +136,6 @@ def _load(path: Path, *names: str) -> list[Tensor]:
             f"{path} is damaged ({brief(error)}): remove the folder {path.parent}, and images show the field alone, or "
             "train again."
         ) from error
-
-
-def details_of(folder: Path, step: int) -> Details | None:
-    """The details of a run that belong to its checkpoint of a step; None if it has none. Raises InputError if they are
-    damaged."""
-    kept_at, details = read_details(folder) if (folder / CAMERAS_FILE).is_file() else (None, None)
-    return details if kept_at == step else None
 
 
 def moved_cameras(cameras: Cameras, poses: CameraOptimizer) -> Cameras:

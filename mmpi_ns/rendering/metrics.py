@@ -98,32 +98,6 @@ def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "
     return torch.cat(corrected).view(predicted.shape)
 
 
-def image_scores(
-    metrics: ImageMetrics, outputs: dict[str, Tensor], observed: Float[Tensor, "H W 3"], true: Tensor | None
-) -> dict[str, float]:
-    """Metrics of a rendered image.
-
-    Args:
-        metrics: of colours.
-        outputs: of the image; "field_rgb" are the colours of the field alone, if details were added.
-        observed: the image.
-        true: distances of its pixels, 0 where unknown, if there are any. [H, W, 1]
-
-    Returns:
-        Those of ``metrics``; "field_..." of the field alone; the mean "dropped_mass"; and where distances are known the
-        relative error of rendered ones: the median, and the fraction above a tenth.
-    """
-    values = metrics(outputs["rgb"], observed)
-    if "field_rgb" in outputs:
-        values |= {f"field_{name}": value for name, value in psnr_and_ssim(outputs["field_rgb"], observed).items()}
-    values["dropped_mass"] = float(outputs["dropped_mass"].mean())
-    if true is not None and bool((true > 0).any()):
-        predicted, true = outputs["depth"], true.to(outputs["depth"])
-        error = (predicted[true > 0] / true[true > 0] - 1).abs()
-        values |= {"depth_error": float(error.median()), "depth_outliers": float((error > 0.1).float().mean())}
-    return values
-
-
 def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:
     """Images for display of a rendered image. Pixels that a texel spans: blue from 1/2, green 2, red from 8 on."""
     near = 1 / outputs["depth"].clamp(min=1e-9)

@@ -27,14 +27,6 @@ def new_table(tiles: Int[Tensor, "T"], channels: int, empty: float = 0.0, dtype=
     return table
 
 
-def read_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice) -> Float[Tensor, "P H W C"]:
-    """Texels of some planes of one head, as images."""
-    tiles = grid.own_tiles[planes]
-    blocks = table.view(-1, SIDE, SIDE, table.shape[-1])[tiles.to(torch.int64)]
-    images = blocks.permute(0, 1, 3, 2, 4, 5).reshape(len(tiles), grid.down * SIDE, grid.across * SIDE, -1)
-    return images[:, : grid.height, : grid.width]
-
-
 def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, images: Float[Tensor, "P H W C"]) -> None:
     """Stores images in the existing bricks; texels of other tiles are left out."""
     tiles = grid.own_tiles[planes]
@@ -132,7 +124,10 @@ def resample(
         for sources, planes in _chunks(target):
             if not bool(target.own_tiles[planes].any()):
                 continue
-            images = read_planes(table, source, sources)
+            bricks = source.own_tiles[sources].to(torch.int64)
+            blocks = table.view(-1, SIDE, SIDE, table.shape[-1])[bricks].permute(0, 1, 3, 2, 4, 5)
+            images = blocks.reshape(len(bricks), source.down * SIDE, source.across * SIDE, -1)
+            images = images[:, : source.height, : source.width]
             stored = stored_texels(source, sources).to(table.dtype)
             if bool(stored.all()):
                 write_planes(out, target, planes, _resize(images, target))

@@ -7,7 +7,7 @@ Points are represented as homogeneous pairs ``(o/t + d, 1/t)``, which are finite
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -47,10 +47,6 @@ class Frames:
         shares = 1.0 - nears * ends
         steps = shares / (nears * (planes - 1).to(dtype))
         return Frames(origins, axes, nears, extents, planes, ends, shares, steps)
-
-    def one(self, k: int) -> Frames:
-        """Frame k alone."""
-        return Frames(*(getattr(self, f.name)[k : k + 1] for f in fields(self)))
 
 
 @dataclass(frozen=True)

@@ -106,12 +106,12 @@ class Web(_Run):
         self.check_paths(path, is_file=self.single_file)
         scene = self.bake()
         from mmpi_ns.export.files import write_baked
-        from mmpi_ns.export.web import write_page, write_single_file
+        from mmpi_ns.export.web import write_page
 
         if self.single_file:
             with tempfile.TemporaryDirectory(dir=path.parent) as folder:
                 write_baked(scene, Path(folder))
-                write_single_file(Path(folder), path)
+                write_page(Path(folder), path)
             print(f"Wrote {path}: {path.stat().st_size / 1e6:.1f} MB. Open it in a browser.")
             return
         size = write_baked(scene, self.output)

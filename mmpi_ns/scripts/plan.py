@@ -12,7 +12,7 @@ import tyro
 from mmpi_ns.placement.defaults import DEFAULTS, check_placement, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
-from mmpi_ns.utils.errors import InputError, quoted
+from mmpi_ns.utils.errors import InputError, looked_at, quoted
 from mmpi_ns.utils.host import enter_command, values_of
 
 if TYPE_CHECKING:
@@ -45,13 +45,14 @@ class PlanCommand:
 
     def main(self) -> None:
         # Slow imports, which --help does not need.
-        from mmpi_ns.capture.datamanager import check_there, load_observations
+        from mmpi_ns.capture.datamanager import load_observations
         from mmpi_ns.placement.split import most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import write_errors
 
         check_placement(self.placement, "--placement.")
-        check_there(self.scene)
+        if not self.scene.exists():
+            raise InputError(f"There is no scene at {looked_at(self.scene)}: check the path.")
         with write_errors(self.output, "--output"):
             self.output.mkdir(parents=True, exist_ok=True)
         # Before the images are read, so that an error in it is reported at once.

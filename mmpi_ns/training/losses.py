@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.capture.ray_sources import EXPOSURE, KEYPOINT_DEPTH, PIXEL_DEPTH
@@ -22,8 +22,9 @@ PLANE_ERROR = 0.6
 """Minimum error of a known depth, in spacings of the densest planes."""
 TV_EVERY = 4
 """Total variation is added every this many steps, with its weight multiplied by the same number."""
-KEYPOINT_WIDTH = 0.06
-"""Standard deviation of the window round an SfM keypoint, relative to its inverse distance."""
+KEYPOINT_WIDTH, KEYPOINT_OUTLIERS = 0.06, 1e-4
+"""Standard deviation of the window round an SfM keypoint, relative to its inverse distance, and likelihood of a false
+one. Its mean is over the keypoint rays that can reach their point."""
 
 
 @dataclass
@@ -90,33 +91,22 @@ def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]
     return -(p * p.log() + (1 - p) * (1 - p).log()).mean()
 
 
-def keypoint_depth(mass: Float[Tensor, "R"], reached: Bool[Tensor, "R"]) -> Float[Tensor, ""]:
-    """-log of the weight mass near SfM keypoints, mean over the rays that can reach theirs.
+def known_depth(
+    mass: Float[Tensor, "R"], reached: Bool[Tensor, "R"], outliers: float, count: Int[Tensor, ""] | int
+) -> Float[Tensor, ""]:
+    """-log of the likelihood of known inverse distances given the weights along their rays, mean over ``count`` rays.
 
-    Rays without a sample near their point carry no information about it and are left out.
-
-    Args:
-        mass: weights round the point (``ops.depth_sums``, the window KEYPOINT_WIDTH of its inverse distance).
-        reached: rays with a sample near it.
-    """
-    nll = torch.where(reached, -torch.log(mass + 1e-4), torch.zeros_like(mass))
-    return nll.sum() / reached.sum().clamp(min=1)
-
-
-def known_depth(mass: Float[Tensor, "R"], reached: Bool[Tensor, "R"], outliers: float = 0.02) -> Float[Tensor, ""]:
-    """-log of the likelihood of measured inverse distances given the weights along their rays, mean over all rays.
-
-    A measurement is either right, so that the weights lie within its error, exp(-1/2 ((q - q0) / error)^2), or an
-    outlier, so that they may lie anywhere: -log(mass + outliers). The gradient is at most 1 / outliers, so a
-    measurement that many views contradict is ignored.
+    A distance is either right, so that the weights lie within its error, exp(-1/2 ((q - q0) / error)^2), or an outlier,
+    so that they may lie anywhere: -log(mass + outliers). The gradient is at most 1 / outliers, so a distance that many
+    views contradict is ignored. Rays without a sample near theirs tell nothing of it and add nothing.
 
     Args:
-        mass: weights round the measured inverse distance (``ops.depth_sums``, the window its error).
+        mass: weights round the known inverse distance (``ops.depth_sums``, the window its error).
         reached: rays with a sample near it.
         outliers: likelihood of an outlier.
+        count: rays that the mean is over.
     """
-    nll = torch.where(reached, -torch.log(mass + outliers), torch.zeros_like(mass))
-    return nll.mean() if len(nll) else mass.sum()
+    return torch.where(reached, -torch.log(mass + outliers), torch.zeros_like(mass)).sum() / count
 
 
 def batch_losses(
@@ -144,8 +134,7 @@ def batch_losses(
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)
     # If MPIs train separately and cover a ray only in part, they need not explain the remaining transmittance.
-    explained = rays.samples.explained[pixels]
-    background = torch.where(explained, random, observed)
+    background = torch.where(rays.samples.explained[pixels], random, observed)
     shown = (rays.rgb, rays.sums.mass, rays.sums.first, rays.sums.second, rays.composite.transmittance)
     colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in shown)
     rgb = colors + transmittance * background
@@ -157,12 +146,13 @@ def batch_losses(
         "distortion": weight.distortion * sums.spread.index_select(0, pixels).mean(),
     }
     if KEYPOINT_DEPTH in rays.bundle.metadata and len(keypoints):
-        total["keypoint_depth"] = weight.keypoint_depth * keypoint_depth(
-            sums.mass.index_select(0, keypoints), sums.reached[keypoints]
+        reached = sums.reached[keypoints]
+        total["keypoint_depth"] = weight.keypoint_depth * known_depth(
+            sums.mass.index_select(0, keypoints), reached, KEYPOINT_OUTLIERS, reached.sum().clamp(min=1)
         )
     if PIXEL_DEPTH in rays.bundle.metadata and weight.known_depth > 0:
         total["known_depth"] = weight.known_depth * known_depth(
-            sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers
+            sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers, max(1, len(pixels))
         )
     if rays.lookup is not None and step % TV_EVERY == 0 and field.density.requires_grad:
         variation = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features, weight.tv_chroma)

@@ -109,25 +109,20 @@ def fit_memory(
 
 
 def reserved_bytes(plan: ScenePlan, work: Work, device: str | torch.device) -> int:
-    """Bytes of a GPU that tables must leave: for a step, for a picture in the viewer, and for torch's allocator.
+    """Bytes of a GPU that tables must leave: for a step at full resolution, when rays end at surfaces, for a picture in
+    the viewer, and for torch's allocator.
 
     A machine without a GPU has its program and a step's buffers in memory that it can swap: 0.
     """
     if torch.device(device).type != "cuda":
         return 0
-    kept = MarchOptions(work.threshold).most_kept(plan.samples_per_ray)
-    step = step_bytes(plan, work) + BYTES_IN_ONE_PASS * kept * CPU_RAYS
-    return int((1 + ALLOCATOR_SHARE) * step) + ALLOCATOR_BYTES
-
-
-def step_bytes(plan: ScenePlan, work: Work) -> int:
-    """Peak bytes of a training step's own arrays on a GPU at full resolution, when rays end at surfaces."""
     rays = RAYS_PER_PIXEL_RAY * work.pixel_rays * (len(plan.mpis) if work.all_mpis else 1)
     room = MarchOptions(work.threshold).most_kept(plan.samples_per_ray)
     width, kept, taps = min(room, TYPICAL_WIDTH), min(room, TYPICAL_KEPT), 8 if plan.cube else 4
     row = 4 * COPIES * (1 + work.feature_channels + work.two_phase)
     each = BYTES_PER_SLOT * room + BYTES_PER_PACKED * width
-    return rays * (each + kept * taps * BYTES_PER_TAP) + min(rays * kept * taps, plan.texels) * row
+    step = rays * (each + kept * taps * BYTES_PER_TAP) + min(rays * kept * taps, plan.texels) * row
+    return int((1 + ALLOCATOR_SHARE) * (step + BYTES_IN_ONE_PASS * room * CPU_RAYS)) + ALLOCATOR_BYTES
 
 
 def count_tiles(plan: ScenePlan) -> int:

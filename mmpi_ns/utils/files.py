@@ -1,4 +1,4 @@
-"""Atomic files, and text in a checkpoint."""
+"""Atomic files, images that may be damaged, and text in a checkpoint."""
 
 from __future__ import annotations
 
@@ -9,11 +9,26 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mmpi_ns.utils.errors import WriteError, brief
+from PIL import Image
+
+from mmpi_ns.utils.errors import InputError, WriteError, brief
 
 if TYPE_CHECKING:
     from jaxtyping import UInt8
     from torch import Tensor
+
+# Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
+UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
+
+
+@contextmanager
+def opened(name: Path) -> Iterator[Image.Image]:
+    """An image file that is read within the block; InputError names it where that cannot be done."""
+    try:
+        with Image.open(name) as image:
+            yield image
+    except UNREADABLE as error:
+        raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or leave it out.") from error
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], folder: Path | None = None) -> None:

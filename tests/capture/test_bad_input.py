@@ -153,7 +153,7 @@ def move_points(data, move):
 def test_a_scene_without_points_says_how_it_finds_some(tmp_path, capsys):
     manager = datamanager(write_scene(tmp_path / "bare", sfm=False))
     said = " ".join(capsys.readouterr().out.split())
-    assert "No SfM tracks: matching the features" in said and "a quick plane sweep locates" in said
+    assert "No SfM tracks: matching the features" in said and "a quick search for surfaces locates" in said
     assert len(place(manager.observations, PlacementConfig()).mpis) >= 1
 
 

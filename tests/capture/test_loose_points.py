@@ -80,24 +80,24 @@ def test_a_point_that_the_cloud_would_hide_is_seen_where_matches_confirm_it():
     assert not np.isin(1 + np.arange(len(ground)), see_points(seen.points, cameras(AHEAD)).seen_point).all()
 
 
-def observations(points=0, tracked=0, swept=0) -> Observations:
+def observations(points=0, tracked=0, searched=0) -> Observations:
     return Observations(
         camera_to_worlds=BOTH.camera_to_worlds,
         intrinsics=BOTH.intrinsics,
         sizes=BOTH.sizes,
         points=np.full((points, 3), 9.0),
-        seen_by=np.zeros(tracked + swept, np.int64),
-        seen_point=np.arange(tracked + swept) % max(points, 1),
+        seen_by=np.zeros(tracked + searched, np.int64),
+        seen_point=np.arange(tracked + searched) % max(points, 1),
         seen_at=np.full((tracked, 2), 5.0),
         loose=np.zeros((1, 3)),
     )
 
 
-def test_sightings_come_after_the_tracks_and_before_swept_points_without_contradicted_ones():
+def test_sightings_come_after_the_tracks_and_before_searched_points_without_contradicted_ones():
     points = np.array([[-0.5, 0, -1.0], [0.5, 0, -1], [0.6, 0.1, -1]])
     seen = see_points(points, cameras(AHEAD, AHEAD), flat_depth(3.0))
     assert seen.contradicted.tolist() == [2, 0, 0]
-    joined = seen.added_to(observations(points=4, tracked=2, swept=2))
+    joined = seen.added_to(observations(points=4, tracked=2, searched=2))
     assert len(joined.points) == 7 and joined.loose is None
     assert joined.seen_point.tolist() == [0, 1, 5, 6, 5, 6, 2, 3]
     assert joined.seen_by.tolist() == [0, 0, 0, 0, 1, 1, 0, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from PIL import Image
 from tiny_scene import write_colmap
 
 from mmpi_ns.capture import observe as mmpi_observations
@@ -21,9 +23,11 @@ from mmpi_ns.capture.observe import (
     posed_images,
     read_observations,
     tell_poses,
+    with_surfaces,
     with_tracks,
 )
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model, numbers_in_model
+from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
 
@@ -107,21 +111,45 @@ def test_tracks_come_in_pixels_of_the_camera_whose_place_names_them():
     assert np.array_equal(found.points, np.arange(12.0).reshape(4, 3))
 
 
-@pytest.mark.parametrize(("each", "swept"), [(ENOUGH_KEYPOINTS, False), (ENOUGH_KEYPOINTS - 1, True)])
-def test_images_are_swept_only_where_triangulation_finds_too_few_keypoints(monkeypatch, each, swept):
+@pytest.mark.parametrize(("each", "searched"), [(ENOUGH_KEYPOINTS, False), (ENOUGH_KEYPOINTS - 1, True)])
+def test_surfaces_are_searched_only_where_triangulation_finds_too_few_keypoints(monkeypatch, each, searched):
     tracks = [(camera, 0, 0.5, 0.5) for camera in (0, 1) for _ in range(each)]
     monkeypatch.setattr(mmpi_observations, "digest", lambda *parts: "key")
     monkeypatch.setattr(mmpi_observations, "remembered", lambda key, find: find())
     monkeypatch.setattr(mmpi_observations, "triangulate", lambda images: model(*tracks))
     monkeypatch.setattr(mmpi_observations, "at_full_size", lambda images: images)
     calls = []
-    monkeypatch.setattr(mmpi_observations, "add_swept_points", lambda found, images: calls.append(images) or found)
-    image = {"image": torch.zeros(20, 40, 3, dtype=torch.uint8)}
-    data = as_data(get_data=lambda i, image_type: image)
-    found = mmpi_observations._find_points(bare(), data, triangulates=True)
-    assert len(found.seen_by) == 2 * each and len(calls) == swept
-    mmpi_observations._find_points(bare(), data, triangulates=False)
-    assert len(calls) == swept + 1 and [i.shape for i in calls[-1]] == [(20, 40)] * 2
+    monkeypatch.setattr(mmpi_observations, "with_surfaces", lambda found, images: calls.append(images) or found)
+    found = mmpi_observations._find_points(bare(), as_data(), triangulates=True)
+    assert len(found.seen_by) == 2 * each and len(calls) == searched
+    mmpi_observations._find_points(bare(), as_data(), triangulates=False)
+    assert len(calls) == searched + 1 and len(calls[-1].files) == 2
+
+
+@pytest.mark.parametrize("depth", [12.0, 120.0])
+def test_searched_surfaces_lie_on_a_textured_wall(tmp_path, depth):
+    """Also on one so far away that it moves by three pixels from the first image to the last."""
+    count, (width, height), focal = 5, (248, 76), 144.0
+    poses = np.tile(np.eye(4)[:3], (count, 1, 1))
+    poses[:, 0, 3] = centers = np.linspace(-1, 1, count)
+    rng, (ys, xs), files = np.random.default_rng(3), np.mgrid[0:height, 0:width] + 0.5, []
+    waves, phases = rng.normal(size=(40, 2)) * 20 / depth, rng.uniform(0, 6, 40)
+    for i, center in enumerate(centers):
+        wall = np.stack([(xs - width / 2) / focal, (ys - height / 2) / focal], -1) * depth + [center, 0]
+        levels = 127 + 9 * np.sin(wall @ waves.T + phases).sum(-1)
+        files.append(tmp_path / f"{i}.png")
+        Image.fromarray(levels.clip(0, 255).round().astype(np.uint8)).save(files[-1])
+    pinholes, sizes = np.tile([focal, focal, width / 2, height / 2], (count, 1)), np.tile([width, height], (count, 1))
+    cameras = replace(Observations.of_cameras(poses, pinholes, sizes), points=np.ones((3, 3)))
+    found = with_surfaces(cameras, PosedImages(tuple(files), poses, pinholes, sizes, np.zeros((count, 4))))
+    assert np.array_equal(found.points[:3], np.ones((3, 3))) and len(found.points) > 500 and not len(found.seen_at)
+    assert np.percentile(np.abs(found.points[3:, 2] + depth), 80) < 0.1 * depth
+    # Every view counts for a point that falls on its image, and no other does.
+    local = found.points[3:] - poses[:, None, :, 3]
+    shown = np.abs(focal * local[..., :2] / local[..., 2:]) < [width / 2, height / 2]
+    expected = {(int(i), int(p) + 3) for i, p in np.argwhere(shown.all(-1))}
+    assert set(zip(found.seen_by.tolist(), found.seen_point.tolist(), strict=True)) == expected
+    assert len(found.seen_by) == len(expected) > 2 * len(found.points)
 
 
 def test_poses_that_are_off_are_told_with_the_command_that_mends_them(capsys):
@@ -135,7 +163,7 @@ def test_poses_that_are_off_are_told_with_the_command_that_mends_them(capsys):
 
 
 def test_a_mask_leaves_out_the_keypoints_on_its_black_pixels():
-    """Rows and columns differ, so that neither can stand for the other; what the sweep found has no keypoint."""
+    """Rows and columns differ, so that neither can stand for the other; what a search found has no keypoint."""
     tracks = with_tracks(bare(), model((0, 0, 0.7, 0.1), (0, 1, 0.1, 0.7), (1, 2, 0.7, 0.1), (1, 3, 0.999, 0.999)))
     masks = [np.ones((20, 40), bool), np.ones((60, 80), bool)]
     masks[0][10:, :20] = False

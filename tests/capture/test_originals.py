@@ -16,7 +16,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from mmpi_ns.capture.dataset import take_local_origins, with_cameras_of_copies
+from mmpi_ns.capture.dataset import LocalOrigin, take_local_origins
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, original_of
 from mmpi_ns.prepare.export import downscale
 
@@ -152,4 +152,5 @@ def test_cameras_of_copies_without_originals_stay(tmp_path):
     file = write(tmp_path / "images_4/x.png", 310, 93)
     camera = Cameras(torch.eye(4)[None, :3], 180.5, 181.5, 152.25, 43.5, 310, 93)
     outputs = DataparserOutputs([file, tmp_path / "images_4/missing.png"], camera)
-    assert float(with_cameras_of_copies(outputs, 4).cameras.fx) == 180.5
+    origin = LocalOrigin({"frames": [{"transform_matrix": np.eye(4)}]}, file)
+    assert float(origin.tell(outputs, 4).cameras.fx) == 180.5

@@ -18,7 +18,7 @@ from random_bricks import random_window, scene_of
 import mmpi_ns
 from mmpi_ns.export import files
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
-from mmpi_ns.export.web import write_page, write_single_file
+from mmpi_ns.export.web import write_page
 from mmpi_ns.ops.baked.reader import camera_rays
 from mmpi_ns.scene.baked import neighbours, take_borders
 from mmpi_ns.scene.windows import window_shares
@@ -349,14 +349,14 @@ def test_damaged_details_are_a_sentence_on_the_page(tab, detailed, tmp_path):
 
 
 def test_one_file_shows_details(tab, detailed, tmp_path):
-    write_single_file(detailed, tmp_path / "one.html")
+    write_page(detailed, tmp_path / "one.html")
     assert tab.open((tmp_path / "one.html").as_uri()) == "ready"
     tab.until(f"{WHOLE} && mmpi.details.ready(mmpi.path[0]) && mmpi.details.views.length === 3")
     assert psnr(shown(tab, 0), detailed_image(detailed, 0)) > 38
 
 
 def test_one_file_opens_from_the_disk(tab, site, tmp_path):
-    write_single_file(site, tmp_path / "one.html")
+    write_page(site, tmp_path / "one.html")
     assert tab.open((tmp_path / "one.html").as_uri()) == "ready"
     tab.until(WHOLE)
     assert shown(tab, 0).std() > 0.02

@@ -1,4 +1,4 @@
-"""Placement: expected pixel errors, the choice of MPIs, and the plane sweep."""
+"""Placement: expected pixel errors and the choice of MPIs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from reprojection import median_reprojection_error
 
 from mmpi_ns.placement.errors import mpi_errors, pixel_errors
-from mmpi_ns.placement.observations import Observations, add_swept_points, find_visible_points, pixels_per_pixel
+from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
@@ -168,32 +168,3 @@ def test_points_project_to_where_they_were_seen_and_behind_the_camera_to_nowhere
     assert median_reprojection_error(observations) < 1e-9
     behind = 2 * observations.centers[seen] - points
     assert not observations.project(seen, behind)[1].any()
-
-
-def test_the_plane_sweep_finds_the_depth_of_a_textured_wall():
-    depth, count = 12.0, 5
-    centers = np.stack([np.linspace(-1, 1, count), np.zeros(count), np.zeros(count)], -1)
-    observations = observed(centers, np.array([[0.0, 0.0, depth]]))
-    empty = np.zeros(0, np.int64)
-    observations = replace(
-        observations, points=np.zeros((0, 3)), seen_by=empty, seen_point=empty, seen_at=np.zeros((0, 2))
-    )
-    rng = np.random.default_rng(3)
-    waves = rng.normal(size=(12, 2)) * 1.5
-    phases = rng.uniform(0, 6, 12)
-    width, height = 124, 38
-    scale = width / WIDTH
-    ys, xs = np.mgrid[0:height, 0:width] + 0.5
-    images = []
-    for c in centers:
-        wall = np.stack([(xs / scale - WIDTH / 2) / FOCAL, (ys / scale - HEIGHT / 2) / FOCAL], -1) * depth + c[:2]
-        images.append(0.5 + 0.04 * np.sin(wall @ waves.T + phases).sum(-1))
-    found = add_swept_points(observations, images)
-    assert len(found.points) > 50
-    assert np.percentile(np.abs(found.points[:, 2] - depth), 80) < 0.08 * depth
-    # Every view counts for a point that falls on its image, and no other does.
-    local = found.points - centers[:, None]
-    shown = np.abs(FOCAL * local[..., :2] / local[..., 2:]) < [WIDTH / 2, HEIGHT / 2]
-    wanted = {(int(i), int(p)) for i, p in np.argwhere(shown.all(-1))}
-    assert set(zip(found.seen_by.tolist(), found.seen_point.tolist(), strict=True)) == wanted
-    assert len(found.seen_by) == len(wanted) > 2 * len(found.points) and not shown.all()

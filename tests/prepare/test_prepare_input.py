@@ -20,12 +20,11 @@ from mmpi_ns.prepare.images import (
     gather,
     gather_masks,
     measure,
-    open_image,
     select_frames,
     sharpness,
 )
 from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.poses import make_cameras, opencv_intrinsics, parse_camera
+from mmpi_ns.prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.utils.errors import InputError
 
@@ -193,12 +192,13 @@ def test_focal_length_comes_from_the_option_then_exif_then_a_guess():
         assert camera.mean_focal_length() == expected
 
 
-def test_given_camera_comes_back_from_colmaps():
-    given = parse_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
+def test_given_camera_comes_back_from_colmaps(tmp_path):
+    given = opencv_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
     (camera,) = make_cameras([Photo("a", 100, 50)], "auto", {"a": given}, None, "auto")[1]
     assert opencv_intrinsics(camera) == ([90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004], False)
-    with pytest.raises(InputError, match="--camera takes"):
-        parse_camera((1.0, 2.0), fisheye=False)
+    for numbers, says in (((1.0, 2.0), "--camera takes"), ((-1.0, 2.0, 3.0), "must be positive")):
+        with pytest.raises(InputError, match=says):
+            prepare(Settings(tmp_path, tmp_path / "scene", camera=numbers))
 
 
 def chain(count, loop=None):
@@ -247,12 +247,12 @@ def test_look_alikes_are_found_by_their_features(tmp_path):
 
 def test_split_by_count_and_by_list():
     names = [f"{i}.jpg" for i in range(9)]
-    split = export.split_by_count(names, None, 3)
+    split = export.split_images(names, None, 3)
     assert split.train == ("1.jpg", "4.jpg", "7.jpg") and len(split.test) == 6
     lists = {"train_filenames": ["x/2.jpg"], "test_filenames": ["x/3.jpg", "x/99.jpg"]}
-    assert export.split_from(lists, names, "s").test == ("3.jpg",)
+    assert export.split_images(names, lists=lists, source="s").test == ("3.jpg",)
     with pytest.raises(InputError, match="among the registered"):
-        export.split_from({"train_filenames": ["2.jpg"], "test_filenames": ["77.jpg"]}, names, "s")
+        export.split_images(names, lists={"train_filenames": ["2.jpg"], "test_filenames": ["77.jpg"]}, source="s")
 
 
 def write_video(path, frames):
@@ -324,7 +324,7 @@ def test_an_image_that_pillow_takes_for_an_attack_is_named(tmp_path, monkeypatch
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 30)
     Image.new("RGB", (9, 9)).save(tmp_path / "huge.png")
     with pytest.raises(InputError, match=r"huge.png cannot be read \(Image size \(81 pixels\)"):
-        open_image(tmp_path / "huge.png")
+        gather(tmp_path, [tmp_path / "huge.png"], tmp_path / "work")
 
 
 def test_blank_images_are_refused(tmp_path):

@@ -11,6 +11,7 @@ import pytest
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.rays import RayBundle
 
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
@@ -18,11 +19,10 @@ from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH
 from mmpi_ns.rendering.details import (
     LARGEST,
     LEVELS,
+    Details,
     DetailView,
-    blended_details,
     details_of,
     moved_cameras,
-    read_details,
     write_details,
 )
 from mmpi_ns.utils.errors import InputError
@@ -44,18 +44,26 @@ def random_planes(seed: int, depth: float) -> torch.Tensor:
 
 
 def test_details_are_the_weighted_mean_of_the_views():
-    """Of two cameras to the left and to the right: by shares and viewing angles, worked out by hand."""
-    views = []
+    """Of two cameras to the left and to the right: by shares and viewing angles, worked out by hand. A third one, where
+    shares reach 0, is not read."""
+    views, cameras = [], []
     for x, value in ((-0.5, 0.2), (1.0, -0.1)):
         numbers = torch.tensor([1.0, 0, 0, x, 0, 1, 0, 0, 0, 0, 1, 0, 22, 21, 14.5, 9, *[0.0] * 7, 10])
         inverse = 1 / math.hypot(x, 5)
         views.append(DetailView(torch.tensor([value] * 3 + [inverse]).expand(HEIGHT, WIDTH, 4).contiguous(), numbers))
-    ray = torch.zeros(1, 3), torch.tensor([[0.0, 0, -1]]), torch.tensor([[5.0]])
+        cameras.append(numbers)
+    cameras.append(cameras[-1].index_fill(0, torch.tensor([3]), 2.0))
+    ray = RayBundle(torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0, -1]]]), torch.ones(1, 1, 1))
+    shares = [1 - (distance / 2) ** 2 for distance in (0.5, 1.0)]
     angles = [2 * math.sin(math.atan(x / 5) / 2) for x in (0.5, 1.0)]
-    weights = [share / (angle + 0.01) for angle, share in zip(angles, (0.9, 0.4), strict=True)]
+    weights = [share / (angle + 0.01) for angle, share in zip(angles, shares, strict=True)]
     faded = [value / (1 + (angle / 0.2) ** 2) for angle, value in zip(angles, (0.2, -0.1), strict=True)]
     expected = STRENGTH * (faded[0] * weights[0] + faded[1] * weights[1]) / (sum(weights) + LEAST_WEIGHT)
-    assert torch.allclose(blended_details(views, [0.9, 0.4], *ray), torch.full((1, 3), expected), rtol=1e-3)
+    outputs = {"depth": torch.full((1, 1, 1), 5.0), "accumulation": torch.ones(1, 1, 1), "rgb": torch.zeros(1, 1, 3)}
+    shown = Details(torch.stack(cameras), lambda i, _: views[i]).added(
+        outputs | {"radiance": outputs["rgb"]}, ray, 2, None
+    )
+    assert torch.allclose(shown["radiance"], torch.full((1, 1, 3), expected), rtol=1e-3)
 
 
 def write(folder, cameras, planes, mask=None, step=7, factors=()):
@@ -86,7 +94,7 @@ def test_what_is_written_is_read(tmp_path):
     planes = [random_planes(i, 4.0) for i in range(3)]
     cameras = joined(camera(), camera(0.3), camera(0.6, turn=0.2))
     assert "Details of 3 training images" in write(tmp_path, cameras, planes, factors=[[0.8, 1.0, 1.2]] * 3)
-    details = read_details(tmp_path)[1]
+    details = read_details(tmp_path)
     for i, expected in enumerate(planes):
         view = details.view(i, torch.device("cpu"))
         assert torch.allclose(view.camera[:12].view(3, 4), cameras.camera_to_worlds[i])
@@ -96,25 +104,32 @@ def test_what_is_written_is_read(tmp_path):
         assert torch.allclose(inverse, expected[3], rtol=1e-3)
 
 
+def read_details(folder):
+    """Those of ``write``."""
+    details = details_of(folder, 7)
+    assert details is not None
+    return details
+
+
 def test_an_image_at_a_training_camera_gets_its_details(tmp_path):
     planes = [random_planes(0, 4.0)]
     write(tmp_path, joined(camera()), planes)
     bundle = image_rays(camera())
     outputs = {"depth": 1 / planes[0][3][..., None], "accumulation": torch.ones(HEIGHT, WIDTH, 1),
                "rgb": torch.full((HEIGHT, WIDTH, 3), 0.5)}  # fmt: skip
-    shown = read_details(tmp_path)[1].added(outputs, bundle, 4, None)
+    shown = read_details(tmp_path).added(outputs, bundle, 4, None)
     expected = STRENGTH * planes[0][:3].movedim(0, -1)
     assert torch.allclose(shown["rgb"], (0.5 + expected).clamp(0, 1), atol=4e-3)
     assert bool((shown["field_rgb"] == 0.5).all())
-    double = read_details(tmp_path)[1].added(outputs, bundle, 4, torch.full((3,), 2.0))
+    double = read_details(tmp_path).added(outputs, bundle, 4, torch.full((3,), 2.0))
     assert torch.allclose(double["rgb"], (0.5 + 2 * expected).clamp(0, 1), atol=8e-3)
-    light = read_details(tmp_path)[1].added(outputs | {"radiance": outputs["rgb"]}, bundle, 4, None)
+    light = read_details(tmp_path).added(outputs | {"radiance": outputs["rgb"]}, bundle, 4, None)
     assert torch.allclose(light["radiance"], 0.5 + expected, atol=4e-3) and bool((light["field_radiance"] == 0.5).all())
 
 
 def test_other_surfaces_masks_and_empty_pixels_show_nothing(tmp_path):
     def added(outputs, rays):
-        return read_details(tmp_path)[1].added(outputs, rays, 4, None)["rgb"]
+        return read_details(tmp_path).added(outputs, rays, 4, None)["rgb"]
 
     planes = [torch.cat([torch.full((3, HEIGHT, WIDTH), 0.2), torch.full((1, HEIGHT, WIDTH), 0.25)])]
     bundle, open_ = image_rays(camera(0.4)), torch.ones(HEIGHT, WIDTH, 1)
@@ -137,7 +152,7 @@ def test_details_change_smoothly_as_a_camera_moves(tmp_path):
         for sign in (1, -1, -1, 1, 1, -1)
     ]
     write(tmp_path, joined(*(camera(0.2 * i) for i in range(6))), planes)
-    details, shown = read_details(tmp_path)[1], []
+    details, shown = read_details(tmp_path), []
     for x in np.linspace(0.2, 0.8, 241):
         bundle = image_rays(camera(float(x)))
         nothing, whole = torch.zeros(HEIGHT, WIDTH, 3), torch.ones(HEIGHT, WIDTH, 1)
@@ -182,7 +197,7 @@ def test_damaged_details_are_named(tmp_path):
     write(tmp_path, joined(camera()), [random_planes(0, 4.0)])
     (tmp_path / "00000.npz").write_bytes(b"no archive")
     with pytest.raises(InputError, match=r"00000\.npz is damaged.*remove the folder"):
-        read_details(tmp_path)[1].view(0, torch.device("cpu"))
+        read_details(tmp_path).view(0, torch.device("cpu"))
     (tmp_path / "cameras.npz").write_bytes(b"")
     with pytest.raises(InputError, match=r"cameras\.npz is damaged"):
         details_of(tmp_path, 7)

@@ -176,7 +176,8 @@ def _keypoint(precision: Precision) -> Outcome:
     there = float32(q), torch.ones(6, 9, dtype=torch.bool), torch.zeros(6), targets, 1.0
 
     def keypoint(v: torch.Tensor) -> torch.Tensor:
-        return losses.keypoint_depth(*depth_sums.reference(v, *there)[1:])
+        _, mass, reached = depth_sums.reference(v, *there)
+        return losses.known_depth(mass, reached, losses.KEYPOINT_OUTLIERS, reached.sum().clamp(min=1))
 
     return _loss(precision, keypoint, w, wanted, 60.0, 16)
 

@@ -37,14 +37,14 @@ def distortion(weights, positions, intervals):
 def keypoint_depth(weights, inverse_t, known, valid, relative_width=losses.KEYPOINT_WIDTH):
     targets = torch.cat([known, (relative_width * known).clamp(min=1e-12)], -1)
     sums = depth_sums(weights, inverse_t, valid, torch.ones_like(known[:, 0]), targets, 1.0)
-    return losses.keypoint_depth(sums.mass, sums.reached)
+    return losses.known_depth(sums.mass, sums.reached, losses.KEYPOINT_OUTLIERS, sums.reached.sum().clamp(min=1))
 
 
 def known_depth(weights, inverse_t, known, valid, least_error, outliers=0.02):
     error = (known[:, 1:] ** 2 + least_error**2).sqrt().clamp(min=1e-12)
     targets = torch.cat([known[:, :1], error], -1)
     sums = depth_sums(weights, inverse_t, valid, torch.ones_like(known[:, 0]), targets, 1.0)
-    return losses.known_depth(sums.mass, sums.reached, outliers)
+    return losses.known_depth(sums.mass, sums.reached, outliers, max(1, len(sums.mass)))
 
 
 def test_photometric_is_the_mean_squared_error():
