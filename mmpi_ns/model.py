@@ -1,4 +1,4 @@
-"""The model: plan -> field -> march -> compositing -> outputs."""
+"""The model: plan -> field -> sampler -> compositing -> outputs."""
 
 from __future__ import annotations
 

@@ -18,12 +18,13 @@ from mmpi_ns.field.tables import Lookup
 from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import Composite, composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.gather import RaySums
-from mmpi_ns.ops.march import MarchOptions, MergedSamples, march, show_rays
-from mmpi_ns.rendering.sampler import rays_of
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, show_rays
+from mmpi_ns.rendering.sampler import MMPISampler, rays_of
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
 """Grey levels of backgrounds by name."""
+SAMPLER = MMPISampler()
 
 
 def background_of(name: str, like: Tensor) -> Tensor:
@@ -60,8 +61,8 @@ class RenderingConfig:
 
 @dataclass(frozen=True)
 class RenderedRays:
-    """R rays with S merged samples each: nerfstudio's ``RaySamples`` have no place for a sample's head, plane and NDC.
-    In training, pixel rays, then keypoint rays (both repeated for every MPI that renders them)."""
+    """R rays with S merged samples each. In training, pixel rays, then keypoint rays (both repeated for every MPI that
+    renders them)."""
 
     bundle: RayBundle
     samples: MergedSamples
@@ -133,8 +134,7 @@ def render_rays(
         head_mask: heads that may render each ray; None for all.
         choose: priorities; each ray is rendered by the MPI of highest priority among those it meets (and the cube).
     """
-    with torch.no_grad():  # the field differentiates through the samples that are kept
-        samples = march(field.layout, field.tables, rays_of(bundle, head_mask, choose), options)
+    samples = SAMPLER(bundle, field, options, head_mask, choose)
     tau, lookup = samples.tau, None
     if torch.is_grad_enabled():
         tau, lookup = field.get_density(bundle, samples)
