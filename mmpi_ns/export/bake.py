@@ -97,8 +97,8 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         kept = smoothed(replace(whole, seen=peaks.sum((1, 2))).keep(seen), peaks[seen])
         print(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen.")
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
-    poses = {}  # of all cameras, training and test, by image name
-    for dataset, test in ((pipeline.datamanager.train_dataset, False), (pipeline.datamanager.eval_dataset, True)):
+    poses = {}  # of all cameras, training and test, by image name; those of both are training cameras
+    for dataset, test in ((pipeline.datamanager.eval_dataset, True), (pipeline.datamanager.train_dataset, False)):
         for i, image in enumerate(dataset.image_filenames):
             camera = dataset.cameras[i]
             focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))

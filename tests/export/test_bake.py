@@ -203,6 +203,15 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
     assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
 
 
+def test_cameras_that_train_and_are_scored_are_training_cameras(trainer, monkeypatch):
+    """As in a capture of fewer than ten images without lists; splats are fitted to training cameras."""
+    filled(trainer)
+    manager = trainer.pipeline.datamanager
+    monkeypatch.setattr(manager, "eval_dataset", manager.train_dataset)
+    path = bake_run(trainer.pipeline, 0).path
+    assert len(path) == len(manager.train_dataset) and not any(pose.test for pose in path)
+
+
 def test_codes_are_off_where_training_views_see_little_of_them(trainer, monkeypatch):
     filled(trainer)
     smooth, seen = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis, []
