@@ -92,6 +92,7 @@ REFUSED = {
     "file is null": (frame(file_path=None), ["file_path", "number 4", "None"]),
     "file is empty": (frame(file_path=" "), ["file_path", "number 4"]),
     "file is a list": (frame(file_path=["a.png"]), ["file_path", "number 4"]),
+    "back slashes": (frame(file_path=r"images\none.png"), [r"images\none.png", "write / instead"]),
     "mask is null": (frame(mask_path=None), ["mask_path", "number 4"]),
     "one depth alone": (frame(depth_file_path="a.png"), ["has no depth_file_path and others have one"]),
     # Poses
@@ -135,6 +136,9 @@ REFUSED = {
     "unknown camera model": (file(camera_model="PINHOLE2"), ["camera_model", "'PINHOLE2'", "OPENCV_FISHEYE"]),
     "stereo camera model": (file(camera_model="VR180_L"), ["camera_model", "'VR180_L'", "OPENCV_FISHEYE"]),
     "FISHEYE624 without a lens": (file(camera_model="FISHEYE624"), ["distortion_params", "12 numbers"]),
+    "a camera model of one frame": (frame(camera_model="OPENCV_FISHEYE"), [NAME, "'OPENCV_FISHEYE'", "state it there"]),
+    "fisheye of instant-ngp": (file(is_fisheye=True), ["instant-ngp-data", "OPENCV_FISHEYE"]),
+    "an angle of instant-ngp": (file(fl_x=..., camera_angle_x=1.0), ["camera_angle_x", "no fl_x", "instant-ngp-data"]),
     "camera model is null": (file(camera_model=None), ["camera_model", "None"]),
     "k1 is NaN": (file(k1=NAN), ["distortion k1", "nan"]),
     "k2 is null": (file(k2=None), ["distortion k2", "None"]),
