@@ -57,7 +57,10 @@ class Score:
         check_there(self.data)
         parser = NerfstudioDataParserConfig(data=self.data, downscale_factor=self.downscale_factor)
         check_transforms(parser, self.data, ("test",), opens=True)
-        truths = MMPIDataset(parser.setup().get_dataparser_outputs(split="test"))
+        outputs = parser.setup().get_dataparser_outputs(split="test")
+        if not outputs.image_filenames:
+            raise ValueError(f"{self.data} has no test images: list them as test_filenames in its transforms.json.")
+        truths = MMPIDataset(outputs)
         chosen = evenly(len(truths), self.test_images)
         tests = [truths.image_filenames[i] for i in chosen]
         if not self.images.is_dir():

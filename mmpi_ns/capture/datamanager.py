@@ -133,6 +133,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             with opened(name):
                 pass
         self.train_dataset = dataset = super().create_train_dataset()
+        if not len(dataset):
+            raise InputError("The capture holds no training image: check the split that the data parser made.")
         if min(int(dataset.cameras.width.min()), int(dataset.cameras.height.min())) < 1:
             raise InputError(
                 f"--pipeline.datamanager.camera-res-scale-factor {self.config.camera_res_scale_factor:g} leaves no "

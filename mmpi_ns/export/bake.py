@@ -143,7 +143,7 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> dict[str, dict[str,
     dataset, metrics = pipeline.datamanager.eval_dataset, ImageMetrics("none")
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}
     for i in torch.linspace(0, len(dataset) - 1, min(count, len(dataset))).long().tolist():
-        bundle, truth = image_rays(dataset.cameras[i : i + 1]), dataset[i]["image"][..., :3]
+        bundle, truth = image_rays(dataset.cameras[i : i + 1]), pipeline.model.observed(dataset[i]).cpu()
         exact = None
         for name, image_of in (("exact", pipeline.model.get_outputs_for_camera_ray_bundle), ("baked", scene.image)):
             start = time.process_time()

@@ -213,6 +213,13 @@ def test_names_that_say_no_split_are_refused_where_they_must(data, edit, tmp_pat
     assert name_of(0) in said and "neither train nor eval" in said
 
 
+def test_a_capture_without_training_images_is_refused(data, edit, tmp_path):
+    edit(lambda meta: [meta.pop(f"{split}_filenames") for split in ("train", "val", "test")])
+    options = {"eval_mode": "interval", "eval_interval": 1}
+    said = train(data, tmp_path, **{f"pipeline__datamanager__dataparser__{k}": v for k, v in options.items()}).sentence
+    assert "holds no training image" in said
+
+
 TEXTS = {
     "empty": "", "cut short": '{"frames": [', "a list": "[1, 2]", "no frames": "{}", "frames empty": '{"frames": []}',
     "frames of numbers": '{"frames": [3]}', "frames null": '{"frames": null}', "deep": "[" * 100_000,
