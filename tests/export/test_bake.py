@@ -219,7 +219,7 @@ def test_see_through_test_images_are_compared_over_the_background(trainer, monke
     scene, dataset = bake_run(trainer.pipeline, 0), trainer.pipeline.datamanager.eval_dataset
     shown = model.get_outputs_for_camera_ray_bundle(image_rays(dataset.cameras[:1]))["rgb"]
     background = float(model.observed({"image": torch.zeros(1, 1, 4)}).mean())
-    hidden = torch.tensor([0.5, 0.5, 0.5, 0.0]).expand(*shown.shape[:2], 4)  # gray, all see-through
+    hidden = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(*shown.shape[:2], 4)  # red, all see-through
     monkeypatch.setattr(dataset, "get_data", lambda *_, **__: {"image": hidden})
     expected = psnr(torch.full_like(shown, background), shown)
     assert compare(trainer.pipeline, scene, 1)["exact"]["psnr"] == pytest.approx(expected, abs=1e-3)
