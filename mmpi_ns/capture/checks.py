@@ -123,6 +123,23 @@ def say_once(text: str) -> None:
     CONSOLE.print(text)
 
 
+def colmap_models(folder: Path) -> list[str]:
+    """Usual places below a folder that hold a COLMAP model."""
+    return [
+        place
+        for place in ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "dense/sparse")
+        if any((folder / place / f"cameras.{ending}").is_file() for ending in ("bin", "txt"))
+    ]
+
+
+def _parser_of(folder: Path) -> str:
+    """A data parser for a folder without transforms.json, by what is there, as it is named on the command line."""
+    if (folder / "transforms_train.json").is_file():
+        return "blender-data"
+    model = next(iter(colmap_models(folder)), "colmap/sparse/0")
+    return "colmap" if model == "colmap/sparse/0" else f"colmap --colmap-path {model}"
+
+
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if not path.is_file() and command() in LOAD_RUNS:
         how = "in the run's config.yml (data, under pipeline.datamanager)"
@@ -135,9 +152,10 @@ def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
             f"was started: start the command there, or give the whole path {how}."
         )
     if not path.is_file():
+        parser = _parser_of(path.parent)
         raise InputError(
             f"There is no {looked_at(path)}: check --data, make one with mmpi-prepare, or name the data parser of "
-            "another format after the options (for example: ns-train mmpi-small --data FOLDER colmap)."
+            f"another format after the options (for example: ns-train mmpi-small --data FOLDER {parser})."
         )
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))

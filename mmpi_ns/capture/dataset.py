@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from mmpi_ns.capture.checks import UNREADABLE, check_places, names_of_copies, opened, say_once
+from mmpi_ns.capture.checks import UNREADABLE, check_places, colmap_models, names_of_copies, opened, say_once
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
@@ -290,7 +290,10 @@ class LocalColmap(ColmapDataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         model = self.config.data / self.config.colmap_path
         if not model.is_dir():
-            raise InputError(f"There is no COLMAP model at {model}: check --data, and --colmap-path after colmap.")
+            there = "".join(f" ({place} holds one)" for place in colmap_models(self.config.data)[:1])
+            raise InputError(
+                f"There is no COLMAP model at {model}: check --data, and --colmap-path after colmap{there}."
+            )
         outputs = super()._generate_dataparser_outputs(split, **kwargs)
         return with_cameras_of_copies(self._origin.tell(outputs), self._downscale_factor)
 

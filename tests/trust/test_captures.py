@@ -243,6 +243,15 @@ def test_a_folder_without_transforms_is_named_with_what_to_do(tmp_path):
     assert "There is no" in said and "mmpi-prepare" in said and "colmap" in said
 
 
+def test_a_folder_without_transforms_is_told_the_parser_that_fits(data, tmp_path):
+    (data / "transforms.json").rename(data / "transforms_train.json")
+    assert "--data FOLDER blender-data)" in train(data, tmp_path).sentence
+    (data / "transforms_train.json").unlink()
+    assert "--data FOLDER colmap)" in train(data, tmp_path).sentence
+    (data / "colmap/sparse").rename(data / "sparse")
+    assert "--data FOLDER colmap --colmap-path sparse/0)" in train(data, tmp_path).sentence
+
+
 RUNS = {
     "tiny coordinates": places(lambda p: p * 1e-9),
     "large coordinates": places(lambda p: p * 1e6),
