@@ -116,7 +116,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """The sources of all cameras, if they are in memory all the time."""
         self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
         """Rays of the next step with what they are drawn from, their step and number."""
-        parser = config.dataparser
+        parser: Any = config.dataparser
+        factor = getattr(parser, "downscale_factor", None)
+        if isinstance(factor, float) and factor.is_integer():  # of ns-render dataset
+            parser.downscale_factor = int(factor)
         check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
             mode = kwargs.get("test_mode", "val")
