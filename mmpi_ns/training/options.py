@@ -13,12 +13,13 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
+from mmpi_ns.capture.checks import LOAD_RUNS
 from mmpi_ns.placement.defaults import DEFAULTS, NOT_NEGATIVE, POSITIVE, check_placement
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import write_errors
-from mmpi_ns.utils.host import arguments, values_of
+from mmpi_ns.utils.host import arguments, command, values_of
 from mmpi_ns.utils.machine import unused_gpu
 from mmpi_ns.utils.values import Number, check_number, check_options, shown
 
@@ -106,6 +107,23 @@ def check_nothing_left(model: Any) -> None:
                 f"The run's config.yml asks for {option} {shown(getattr(group, name))}, which this version lacks: "
                 "use the version that trained the run, or train anew without it."
             )
+
+
+def folder_beside_config(config: TrainerConfig, folder: Path) -> Path:
+    """The folder of a run's checkpoints: beside the config.yml that the command was given where the one that it names
+    is gone, as the run was moved. Its windows are looked for there too."""
+    for given in values_of("--load-config") if command() in LOAD_RUNS and not folder.is_dir() else ():
+        moved = Path(given).absolute().parent / config.relative_model_dir
+        if moved.is_dir():
+            model: Any = config.pipeline.model
+            model.windows_folder = moved.parent / model.windows_folder.name
+            return moved
+    return folder
+
+
+def check_command() -> None:
+    """Raises InputError if ns-eval or ns-render would end in an error after it has loaded the run."""
+    {"ns-eval": check_scoring, "ns-render": check_rendering}.get(command() or "", lambda: None)()
 
 
 def check_scoring() -> None:
