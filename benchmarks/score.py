@@ -31,14 +31,14 @@ class ScoreRow(Bench, Score):
     name = "score"
 
     def run(self) -> None:
-        found, means = Score.main(self)
+        scores, means = self.score()
         report = Report(self)
         scene = f"{self.data.resolve().name} /{self.downscale_factor}"
         row: Row = {"method": self.method, "scene": scene, "given": self.given, "seconds": self.seconds}
         row |= {"frame": self.frame, "memory": self.memory, "remark": self.remark}
-        row |= {"images": len(found), **means, "each": dict(found)}
+        row |= {"images": len(scores), **means, "each": dict(scores)}
         row |= {"command": report.content["made"]["command"]}
-        report.rows[f"{self.method} on {scene}, {len(found)} images"] = row
+        report.rows[f"{self.method} on {scene}, {len(scores)} images"] = row
         head = {f"{key}: {k}": r[k] for key, r in report.rows.items() for k in means if k in r}
         report.finish(head, markdown(report.content))
 

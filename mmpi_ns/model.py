@@ -291,13 +291,16 @@ class MMPIModel(Model):
     # Images ------------------------------------------------------------------------------------------------------
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Renders a camera's image, or what of it lies in a box. Raises InputError where the box has no size."""
+        """Renders a camera's image, or what of it lies in a box. Raises InputError where either has no size."""
         # In the viewer an error would end the render thread while the user types a size: it shows the background.
         if obb_box is not None and not bool((obb_box.S > 0).all()) and current_thread() is main_thread():
             raise InputError(
                 f"The crop box has no size (its sides are {[round(float(s), 6) for s in obb_box.S]}): give crop_scale "
                 "three positive lengths, or leave the crop out."
             )
+        width, height = int(camera.width), int(camera.height)
+        if min(width, height) < 1:
+            raise InputError(f"An image of {width} x {height} pixels shows nothing: give a smaller --downscale-factor.")
         if obb_box is not None:
             return super().get_outputs_for_camera(camera, obb_box)
         return self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))

@@ -46,13 +46,19 @@ class Score:
     lpips: Literal["vgg", "alex", "none"] = "vgg"
     """Network of LPIPS; it is left out where the weights are not available."""
 
-    def main(self) -> tuple[Scores, dict[str, float]]:
+    def main(self) -> None:
+        self.score()
+
+    def score(self) -> tuple[Scores, dict[str, float]]:
         """Scores, prints and returns name and metrics of each image, and the means."""
         counts = {name: Number(0, whole=True) for name in ("downscale_factor", "test_images")}
         check_options(self, counts, "--")
         parser = NerfstudioDataParserConfig(data=self.data, downscale_factor=self.downscale_factor)
         check_transforms(parser, self.data, ("test",), opens=True)
-        truths = MMPIDataset(parser.setup().get_dataparser_outputs(split="test"))
+        outputs = parser.setup().get_dataparser_outputs(split="test")
+        if not outputs.image_filenames:
+            raise ValueError(f"{self.data} has no test images: list them as test_filenames in its transforms.json.")
+        truths = MMPIDataset(outputs)
         chosen = evenly(len(truths), self.test_images)
         tests = [truths.image_filenames[i] for i in chosen]
         if not self.images.is_dir():

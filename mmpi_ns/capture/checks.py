@@ -110,6 +110,23 @@ def say_once(text: str) -> None:
     CONSOLE.print(text)
 
 
+def colmap_models(folder: Path) -> list[str]:
+    """Usual places below a folder that hold a COLMAP model."""
+    return [
+        place
+        for place in ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "dense/sparse")
+        if any((folder / place / f"cameras.{ending}").is_file() for ending in ("bin", "txt"))
+    ]
+
+
+def _parser_of(folder: Path) -> str:
+    """A data parser for a folder without transforms.json, by what is there, as it is named on the command line."""
+    if (folder / "transforms_train.json").is_file():
+        return "blender-data"
+    model = next(iter(colmap_models(folder)), "colmap/sparse/0")
+    return "colmap" if model == "colmap/sparse/0" else f"colmap --colmap-path {model}"
+
+
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if not path.is_file() and command() in LOAD_RUNS:
         how = "in the run's config.yml (data, under pipeline.datamanager)"
@@ -122,9 +139,10 @@ def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
             f"was started: start the command there, or give the whole path {how}."
         )
     if not path.is_file():
+        parser = _parser_of(path.parent)
         raise InputError(
             f"There is no {looked_at(path)}: check --data, make one with mmpi-prepare, or name the data parser of "
-            "another format after the options (for example: ns-train mmpi-small --data FOLDER colmap)."
+            f"another format after the options (for example: ns-train mmpi-small --data FOLDER {parser})."
         )
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
@@ -148,6 +166,10 @@ def _check_files(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], fr
             if not isinstance(value, str) or not value.strip() or "\0" in value:
                 raise InputError(
                     f"The {key} of frame number {i + 1} of {path} is {shown(value)}: give the path of a file as text."
+                )
+            if "\\" in value and not (path.parent / value).is_file():
+                raise InputError(
+                    f"The {key} {cut(value)} of {path} has back slashes and is no file here: write / instead of them."
                 )
     bare = next((f for f in frames if "depth_file_path" not in f), None)
     if bare is not None and any("depth_file_path" in f for f in frames):
@@ -261,8 +283,24 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
     model = meta.get("camera_model", "OPENCV")
     if not isinstance(model, str) or model not in MODELS:
         raise InputError(f"The camera_model of {path} is {shown(model)}: give one of {', '.join(MODELS)}.")
+    other = next((f for f in frames if MODELS.get(str(f.get("camera_model", model))) != MODELS[model]), None)
+    if other is not None:
+        raise InputError(
+            f"Frame {cut(other['file_path'])} of {path} has the camera_model {shown(other['camera_model'])}, and one "
+            f"for the whole file is used ({model}): state it there, and remove frames of other models."
+        )
+    if meta.get("is_fisheye") is True and MODELS[model] != CameraType.FISHEYE:
+        raise InputError(
+            f"{path} is of instant-ngp (is_fisheye): name its data parser after the options (ns-train mmpi-small "
+            "--data FOLDER instant-ngp-data), or write the camera_model OPENCV_FISHEYE."
+        )
     for key in CAMERA:
         lacking = next((f for f in frames if key not in f), None) if key not in meta else None
+        if lacking is not None and "camera_angle_x" in meta:
+            raise InputError(
+                f"{path} has camera_angle_x and no {key}: name the data parser of instant-ngp after the options "
+                f"(ns-train mmpi-small --data FOLDER instant-ngp-data), or add {key}."
+            )
         if lacking is not None:
             raise InputError(f"{path} has no {key}, neither for all frames nor in {cut(lacking['file_path'])}: add it.")
     # With one coefficient for all frames nerfstudio reads none of a frame.

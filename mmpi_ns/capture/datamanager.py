@@ -117,7 +117,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """The sources of all cameras, if they are in memory all the time."""
         self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
         """Rays of the next step with what they are drawn from, their step and number."""
-        parser = config.dataparser
+        parser: Any = config.dataparser
+        factor = getattr(parser, "downscale_factor", None)
+        if isinstance(factor, float) and factor.is_integer():  # of ns-render dataset
+            parser.downscale_factor = int(factor)
         check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
             mode = kwargs.get("test_mode", "val")
@@ -134,6 +137,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             with opened(name):
                 pass
         self.train_dataset = dataset = super().create_train_dataset()
+        if not len(dataset):
+            raise InputError("The capture holds no training image: check the split that the data parser made.")
         if min(int(dataset.cameras.width.min()), int(dataset.cameras.height.min())) < 1:
             raise InputError(
                 f"--pipeline.datamanager.camera-res-scale-factor {self.config.camera_res_scale_factor:g} leaves no "

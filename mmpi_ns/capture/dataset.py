@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from mmpi_ns.capture.checks import check_places, names_of_copies, say_once
+from mmpi_ns.capture.checks import check_places, colmap_models, names_of_copies, say_once
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
@@ -213,7 +213,8 @@ class LocalOrigin:
     def tell(self, outputs: DataparserOutputs, factor: int | None) -> DataparserOutputs:
         """The parser's outputs with the transform from the capture's own coordinates, in float64, for the points of a
         model, and with cameras that fit downscaled copies: the parser divides by the factor, whatever was rounded."""
-        for i, file in enumerate(outputs.image_filenames if factor is not None and factor > 1 else ()):
+        factor = factor or 1
+        for i, file in enumerate(outputs.image_filenames if factor > 1 else ()):
             with suppress(InputError):  # is named when it is read
                 original, _, scale = whole_of(Path(file), size_of(Path(file)))
                 if original != file:
@@ -285,7 +286,10 @@ class LocalColmap(ColmapDataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         model = self.config.data / self.config.colmap_path
         if not model.is_dir():
-            raise InputError(f"There is no COLMAP model at {model}: check --data, and --colmap-path after colmap.")
+            there = "".join(f" ({place} holds one)" for place in colmap_models(self.config.data)[:1])
+            raise InputError(
+                f"There is no COLMAP model at {model}: check --data, and --colmap-path after colmap{there}."
+            )
         outputs = super()._generate_dataparser_outputs(split, **kwargs)
         return self._origin.tell(outputs, self._downscale_factor)
 

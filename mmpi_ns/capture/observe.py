@@ -173,8 +173,6 @@ def tell_poses(off: float, image: Path) -> None:
 def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
     """Training cameras as they are used, with the SfM points and keypoints moved into their frame. Raises InputError
     naming the image whose pose or intrinsics cannot be used."""
-    if not len(outputs.image_filenames):
-        raise InputError("The capture holds no training image: check the split that the data parser made.")
     poses = np.array(cameras.camera_to_worlds.double().cpu())
     flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
     usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)

@@ -40,6 +40,8 @@ COPIES = re.compile(r"(.+)_(\d+)")
 EFFORTS = ((0.0067, False, 15), (0.002, True, 8))
 """Contrast of the faintest features (SIFT), whether a pair is matched again along the epipolar lines of its first
 matches, and its least inliers: for textured images, and for rooms at low resolution (two to four times slower)."""
+FORMATS = {"PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "BMP": ".bmp", "TIFF": ".tif"}
+"""Formats that pycolmap reads, as Pillow calls them, and their endings."""
 ENOUGH = 100
 """Average number of keypoints in an image above which the thorough search is skipped."""
 
@@ -77,6 +79,12 @@ def original_of(file: Path) -> tuple[Path, int]:
             if original.is_file():
                 return original, int(name[2])
     return file, 1
+
+
+def format_of(file: Path) -> str:
+    """The format of an image file, whatever its ending. Raises InputError if it cannot be read (names it)."""
+    with opened(file) as image:
+        return str(image.format)
 
 
 def size_of(file: Path) -> NDArray[np.float64]:
@@ -154,7 +162,8 @@ def triangulate(images: PosedImages) -> SfmModel:
     InputError if an image file cannot be read."""
     pycolmap, tracks, error = load_pycolmap(), None, np.nan
     # By their indices as names, since two folders may contain files of the same name.
-    names = [f"{i:06d}{file.suffix.lower()}" for i, file in enumerate(images.files)]
+    endings = [FORMATS.get(format_of(file)) for file in images.files]
+    names = [f"{i:06d}{ending or '.png'}" for i, ending in enumerate(endings)]
     pairs = [(names[i], names[j]) for i, j in near_pairs(images.camera_to_worlds, NEIGHBOURS)]
     opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
     poses = dict(zip(names, map(sfm.rigid3d, opencv), strict=True))
@@ -174,8 +183,12 @@ def triangulate(images: PosedImages) -> SfmModel:
         with sfm.quiet(), tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
             work, database = Path(folder) / "images", Path(folder) / "database.db"
             work.mkdir()
-            for name, file in zip(names, images.files, strict=True):
-                os.symlink(file.resolve(), work / name)
+            for name, file, ending in zip(names, images.files, endings, strict=True):
+                if ending:
+                    os.symlink(file.resolve(), work / name)
+                    continue
+                with opened(file) as image:
+                    image.convert("L").save(work / name, compress_level=1)
             model = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
             sfm.write_images(model, database)
             options.sift.peak_threshold = contrast

@@ -97,8 +97,8 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
         kept = smoothed(replace(whole, seen=peaks.sum((1, 2))).keep(seen), peaks[seen])
         print(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen.")
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
-    poses = {}  # of all cameras, training and test, by image name
-    for dataset, test in ((pipeline.datamanager.train_dataset, False), (pipeline.datamanager.eval_dataset, True)):
+    poses = {}  # of all cameras, training and test, by image name; those of both are training cameras
+    for dataset, test in ((pipeline.datamanager.eval_dataset, True), (pipeline.datamanager.train_dataset, False)):
         for i, image in enumerate(dataset.image_filenames):
             camera = dataset.cameras[i]
             focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
@@ -143,7 +143,7 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> dict[str, dict[str,
     dataset, metrics = pipeline.datamanager.eval_dataset, ImageMetrics("none")
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}
     for i in torch.linspace(0, len(dataset) - 1, min(count, len(dataset))).long().tolist():
-        bundle, truth = image_rays(dataset.cameras[i : i + 1]), dataset[i]["image"][..., :3]
+        bundle, truth = image_rays(dataset.cameras[i : i + 1]), pipeline.model.observed(dataset[i]).cpu()
         exact = None
         for name, image_of in (("exact", pipeline.model.get_outputs_for_camera_ray_bundle), ("baked", scene.image)):
             start = time.process_time()

@@ -100,10 +100,15 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         least: texels of less weight in all these views are left out.
         most: maximum number of splats; those with the least weight are left out.
         rounds: of fitting colours to renderings of the window.
+
+    Raises:
+        ValueError: if no texel has the least weight.
     """
     texels = _texels(window, window.peaks(pose.rays() for pose in poses))
     group, level = _merged(texels, texels.peaks >= least)
     is_seen = group >= 0
+    if not is_seen.any():
+        raise ValueError(f"No texel has a rendering weight of {least:g} in a training view: give a smaller --weight.")
     weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[is_seen], texels.peaks[is_seen], "amax")
     heaviest = weight.argsort(descending=True)[:most].sort().values
     numbers = torch.full((len(weight),), -1).index_copy(0, heaviest, torch.arange(len(heaviest)))

@@ -37,6 +37,10 @@ LEAST_ANGLE, LEAST_POINTS = 1.0, 20
 minimum number of such points for the scale of a gap."""
 WINDOW = 5
 """Steps before and after a gap that are compared with each other."""
+ZOOMS, FINE_ZOOMS = np.geomspace(0.4, 2.5, 19), np.geomspace(0.91, 1.1, 13)
+"""Focal lengths, over that of the model, with which a camera is tried that only turns; and over the best of them."""
+TURNING, TURNING_PAIRS, TRIED = 0.9, 0.95, 200
+"""Share of a pair's matches, and of the pairs, that such a camera must explain; number of pairs that are tried."""
 APART, TURNED = (0.01, 0.03), (1.0, 2.0)
 """Mean and largest distance between the centres of two mappers, as shares of the track, up to which they found the same
 one, and the same of their rotations, in degrees."""
@@ -81,6 +85,8 @@ class Witness:
     says: str
     """How the mapper made it, in words."""
     model: pycolmap.Reconstruction
+    only_turns: bool = False
+    """Whether a camera that turns in one place would explain the matches as well: then the poses are arbitrary."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,7 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         observations.append((seen[seen >= 0], np.full(len(directions), n), center, directions))
     points_seen, frames, centers, directions = (np.concatenate(column) for column in zip(*observations, strict=True))
     place, rows = {image.image_id: n for n, image in enumerate(images)}, []  # of pairs of registered images
+    matched, fits = [], []
     for a, b, matches in verified_matches(database):
         if a not in place or b not in place or len(matches) < MIN_INLIERS:
             continue
@@ -127,6 +134,8 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         distance = epipolar_distances(model, a, b, (rays[a][left], rays[b][right])) / fit
         fitting, beside = int((distance < 1).sum()), int(((distance >= 1) & (distance < BESIDE)).sum())
         rows.append((place[a], place[b], len(left), int(tracked.sum()), fitting, beside))
+        matched.append((rays[a][left], rays[b][right]))
+        fits.append(fit)
     table = np.array(rows, dtype=np.int64).reshape(-1, 6)
     low, high = table[:, :2].min(1, initial=len(place)), table[:, :2].max(1, initial=0)
     camera, order = model.cameras[images[0].camera_id], {image: i for i, image in enumerate(offered)}
@@ -140,7 +149,41 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         scale_changes(points_seen, frames, centers, directions, len(names)),
         says,
         model,
+        turns_explain(matched, fits),
     )
+
+
+def turns_explain(matched: Sequence[tuple[Array, Array]], fits: Sequence[float]) -> bool:
+    """Whether a camera that only turns explains the matches of nearly all pairs, with one focal length or another.
+
+    Args:
+        matched: matched keypoints of each pair, in the plane z = 1 of either camera. [M, 2] each
+        fits: distance there up to which a match of the pair is explained.
+    """
+    step = max(1, len(matched) // TRIED)
+    tried = list(zip(matched[::step], fits[::step], strict=True))
+    if not tried:
+        return False
+
+    def errors(zoom: float) -> Array:
+        return np.array([_turning_error(a / zoom, b / zoom) / (fit / zoom) for (a, b), fit in tried])
+
+    coarse = min(ZOOMS, key=lambda zoom: float(np.median(errors(zoom))))
+    fine = min(coarse * FINE_ZOOMS, key=lambda zoom: float(np.median(errors(zoom))))
+    return bool(np.mean(errors(fine) < 1) >= TURNING_PAIRS)
+
+
+def _turning_error(first: Array, second: Array) -> float:
+    """Distance in the plane z = 1 within which a rotation takes the share ``TURNING`` of keypoints to their matches."""
+    a, b = (np.c_[xy, np.ones(len(xy))] for xy in (first, second))
+    a, b = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (a, b))
+    best, error = np.ones(len(a), bool), np.zeros(len(a))
+    for _ in range(3):  # the rotation of those that fit it best
+        u, _, v = np.linalg.svd(b[best].T @ a[best])
+        turned = a @ (u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v).T
+        error = np.linalg.norm(turned[:, :2] / turned[:, 2:] - second, axis=-1)
+        best = error <= np.quantile(error, 0.8)
+    return float(np.quantile(error, TURNING))
 
 
 def share(part: Array, whole: Array) -> float:

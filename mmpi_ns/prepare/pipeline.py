@@ -137,7 +137,12 @@ class Preparation:
                 f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
                 "(better twenty), or give known poses (--poses)."
             )
-        self._split([p.name for p in self.photos])  # refuse a split that is impossible before the work
+        # What is impossible is refused before the work.
+        self._split([p.name for p in self.photos])
+        smallest = min(self.photos, key=lambda p: min(p.width, p.height))
+        for factor in s.downscales:
+            if factor > min(smallest.width, smallest.height):
+                raise InputError(f"--downscales {factor} leaves no pixel of {smallest.name}: give smaller factors.")
         lenses = self.known_poses.intrinsics if self.known_poses else {}
         if s.camera is not None:
             numbers = (s.camera[0], *s.camera) if len(s.camera) == 3 else s.camera
@@ -251,7 +256,7 @@ class Preparation:
         left_out = [f"{len(lost)} images have no pose and are left out: {in_short(lost, 8)}"] if lost else []
         left_out += [f"{len(group)} {apart}: {in_short(group, 8)}" for group in groups]
         checks.write_report(model, s.input.name, rows, findings, left_out, note, built)
-        self._publish(findings, model, verdict, split)
+        self._publish([*left_out, *checks.by_kind(findings)], model, verdict, split)
         return verdict
 
     def _split(self, names: Sequence[str]) -> export.Split:
@@ -298,7 +303,7 @@ class Preparation:
         return [*findings, *(checks.Finding("moving?", n, f"{x:.0%} {words}", x) for n, x in moves.items())], None, says
 
     def _publish(
-        self, findings: Sequence[checks.Finding], model: pycolmap.Reconstruction, verdict: Verdict, split: export.Split
+        self, warnings: Sequence[str], model: pycolmap.Reconstruction, verdict: Verdict, split: export.Split
     ) -> None:
         """Moves the scene into place and reports the result; doubtful ones in red."""
         scene = self.settings.scene
@@ -308,7 +313,7 @@ class Preparation:
             say(f"What {scene} held is in {aside}.")
         if not self.settings.keep_work:
             shutil.rmtree(self.work)
-        for line in checks.by_kind(findings):
+        for line in warnings:
             say(line, "yellow")
         is_right = verdict.grade == "right"
         if not is_right:
@@ -316,7 +321,7 @@ class Preparation:
         say(
             f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
             f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
-            "bold red" if not is_right else "" if findings else "green",
+            "bold red" if not is_right else "" if warnings else "green",
         )
         say(f"ns-train mmpi-small --data {quoted(scene)}")
 

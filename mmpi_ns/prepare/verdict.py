@@ -38,6 +38,10 @@ WEAK = 0.8
 """Share of the usual below which matches hold badly beside a jump."""
 NEARLY_ALL = 0.9
 """Share of the images of the largest track below which another has clearly fewer."""
+TURNS = (
+    "A camera that turns in one place explains all matches, so that no distance is known: take images from places that "
+    "are apart."
+)
 REMEDY = (
     "Give --focal (and --lens) if you know them, mask what moves (--masks), or prepare the frames before and after "
     "apart from each other."
@@ -142,9 +146,11 @@ def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool
 
     A different track makes it doubtful unless that one can be dismissed: by its own evidence, or because a third track
     agrees with the chosen one, which fits more matches. If two mappers found the same track independently, doubtful
-    parts of it are accepted.
+    parts of it are accepted. Without parallax it is doubtful whoever agrees.
     """
     alone = judge_alone(chosen, is_sequence)
+    if chosen.only_turns and alone.grade != "broken":
+        return Verdict("doubtful", f"{TURNS} {alone.says}".strip())
     compared = [(other, d) for other in others if (d := agreement(chosen, other)) is not None]
     is_confirmed = any(d.is_same and other.name != chosen.name for other, d in compared)
     against = [

@@ -95,11 +95,11 @@ class Details:
         limit = distances[-1] if len(chosen) > nearest and distances[-1] > 0 else np.inf
         chosen, shares = chosen[:nearest], (1 - (distances / limit) ** 2)[:nearest].tolist()
         views, details = [self.view(i, origins.device) for i in chosen], []
-        columns = (origins, directions, 1 / outputs["depth"].reshape(-1, 1))
-        for rays in zip(*(x.split(PART) for x in columns), strict=True):  # the weighted mean of what the views show
-            total, weight = torch.zeros_like(rays[0]), torch.full_like(rays[2], LEAST_WEIGHT)
-            for view, share in zip(views, shares, strict=True):
-                difference, seen = seen_details(*rays, view.image, view.camera)
+        disparities = 1 / outputs["depth"].reshape(-1, 1)
+        for starts, ways, near in zip(*(x.split(PART) for x in (origins, directions, disparities)), strict=True):
+            total, weight = torch.zeros_like(starts), torch.full_like(near, LEAST_WEIGHT)
+            for view, share in zip(views, shares, strict=True):  # the weighted mean of what they show
+                difference, seen = seen_details(starts, ways, near, view.image, view.camera)
                 total += share * seen * difference
                 weight += share * seen
             details.append(STRENGTH * total / weight)

@@ -169,7 +169,7 @@ def check_same_run(
     if theirs.shape != ours.shape or not torch.allclose(theirs, ours, rtol=1e-4, atol=1e-4):
         raise InputError(
             f"{path} was trained on another capture ({state['capture']['data']}, and {data} here, whose training "
-            "cameras are not the same): resume with the same --data, or train anew."
+            "cameras are not the same): resume with the same --data and the same options of its parser, or train anew."
         )
     stored = WindowedPlan.from_json(to_text(state["pipeline"]["_model.progress.windows_bytes"]))
     if stored != plan:

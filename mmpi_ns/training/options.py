@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import tempfile
 from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -11,15 +13,25 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
+from mmpi_ns.capture.checks import LOAD_RUNS
 from mmpi_ns.placement.defaults import DEFAULTS, NOT_NEGATIVE, POSITIVE, check_placement
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
-from mmpi_ns.utils.errors import InputError
-from mmpi_ns.utils.host import arguments, values_of
+from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.files import write_errors
+from mmpi_ns.utils.host import arguments, command, values_of
 from mmpi_ns.utils.machine import unused_gpu
 from mmpi_ns.utils.values import Number, check_number, check_options, shown
 
 COUNT, SHARE = Number(0, whole=True), Number(0, 1)
+RENDERED = {
+    "--interpolation-steps": Number(1, whole=True),
+    "--frame-rate": Number(1, whole=True),
+    "--seconds": POSITIVE,
+    "--downscale-factor": POSITIVE,
+    "--eval-num-rays-per-chunk": Number(1, whole=True),
+}
+"""Options of ns-render."""
 LONGEST_NAME = 255
 """Bytes of a folder's name."""
 RANGES = {
@@ -97,6 +109,39 @@ def check_nothing_left(model: Any) -> None:
             )
 
 
+def folder_beside_config(config: TrainerConfig, folder: Path) -> Path:
+    """The folder of a run's checkpoints: beside the config.yml that the command was given where the one that it names
+    is gone, as the run was moved. Its windows are looked for there too."""
+    for given in values_of("--load-config") if command() in LOAD_RUNS and not folder.is_dir() else ():
+        moved = Path(given).absolute().parent / config.relative_model_dir
+        if moved.is_dir():
+            model: Any = config.pipeline.model
+            model.windows_folder = moved.parent / model.windows_folder.name
+            return moved
+    return folder
+
+
+def check_command() -> None:
+    """Raises InputError if ns-eval or ns-render would end in an error after it has loaded the run."""
+    {"ns-eval": check_scoring, "ns-render": check_rendering}.get(command() or "", lambda: None)()
+
+
+def check_scoring() -> None:
+    """Raises InputError if ns-eval would end in an error after it has loaded the run."""
+    for output in values_of("--output-path"):
+        if Path(output).suffix != ".json":
+            raise InputError(f"--output-path {output} is no .json file: give the name of one, eval.json for example.")
+        _check_writable(Path(output).parent)
+
+
+def _check_writable(folder: Path) -> None:
+    """Raises WriteError if what a command makes cannot be written there; the folder is made if it is missing."""
+    with write_errors(folder, "--output-path"):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+
+
 def check_rendering() -> None:
     """Raises InputError if ns-render would end in an error after it has loaded the run, or rendered."""
     is_dataset = "dataset" in arguments()
@@ -104,15 +149,44 @@ def check_rendering() -> None:
         raise InputError(
             "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install ffmpeg)."
         )
+    for option, number in RENDERED.items():
+        for word in values_of(option):
+            if word != "None":
+                check_number(option, int(word) if word.lstrip("-").isdigit() else float(word), number)
     names, keeps_alpha = values_of("--rendered-output-names"), values_of("--image-format") == ["png"]
     if is_dataset and "rgba" in names and not keeps_alpha:
         raise InputError("The output rgba is transparent, which JPEG is not: add --image-format png.")
-    keeps_alpha = keeps_alpha and names == ["rgba"] and values_of("--output-format") == ["images"]
+    writes_images = is_dataset or values_of("--output-format") == ["images"]
+    keeps_alpha = keeps_alpha and names == ["rgba"] and writes_images
     if not is_dataset and "rgba" in names and not keeps_alpha:
         raise InputError(
             "The output rgba is transparent, which videos, JPEG and the outputs beside it are not: ask for it alone, "
             "with --output-format images --image-format png."
         )
+    for output in values_of("--output-path"):
+        if not (writes_images or Path(output).suffix):
+            raise InputError(
+                f"--output-path {output} says no format of a film: give a name that ends in .mp4, or add "
+                "--output-format images."
+            )
+        _check_writable(Path(output) if writes_images else Path(output).parent)
+    if "camera-path" in arguments():
+        check_camera_path(Path(next(iter(values_of("--camera-path-filename")), "camera_path.json")))
+
+
+def check_camera_path(file: Path) -> None:
+    """Raises InputError if ns-render cannot follow the path of a file."""
+    try:
+        path = json.loads(file.read_text(encoding="utf-8"))
+        size, cameras = [path["render_width"], path["render_height"], path["seconds"]], path["camera_path"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"The camera path {file} cannot be read ({brief(error)}): save it in the viewer, in the tab Render."
+        ) from error
+    if not cameras:
+        raise InputError(f"The camera path {file} holds no camera: add some in the viewer's tab Render, and save it.")
+    for name, value in zip(("render_width", "render_height", "seconds"), size, strict=True):
+        check_number(f"The {name} of {file}", value, POSITIVE)
 
 
 def check_device(device_type: str) -> None:

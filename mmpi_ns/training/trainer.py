@@ -36,7 +36,7 @@ from mmpi_ns.training.checkpoints import (
 )
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.options import check_device, check_nothing_left, check_rendering, check_run
+from mmpi_ns.training.options import check_command, check_device, check_nothing_left, check_run, folder_beside_config
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
@@ -68,11 +68,11 @@ class MMPITrainerConfig(TrainerConfig):
         """
         enter_command()
         check_nothing_left(self.pipeline.model)
+        check_command()
         if command() == "ns-render":
-            check_rendering()
             manager: Any = self.pipeline.datamanager
             manager.backdrop = BACKGROUNDS[cast(Any, self.pipeline.model).rendering.background]
-        folder = super().get_checkpoint_dir()
+        folder = folder_beside_config(self, super().get_checkpoint_dir())
         steps = checkpoints_in(folder)
         if steps and self.load_dir in (None, folder) and self.load_step is None and self.load_checkpoint is None:
             self.load_step = max(steps)

@@ -41,6 +41,7 @@ WARNINGS = (
     "Detected call of `lr_scheduler.step\\(\\)` before `optimizer.step\\(\\)`",  # parameters that are frozen at first
     "Sparse invariant checks are implicitly disabled",
     "You are using `torch.load` with `weights_only=False`",
+    "To copy construct from a tensor, it is recommended",  # of ns-render interpolate
     "std_mean\\(\\): degrees of freedom",  # of the scores of one test image
 )
 """Beginnings of such warnings of torch and nerfstudio."""
@@ -129,8 +130,11 @@ def command() -> str | None:
 
 
 def arguments() -> list[str]:
-    """The words after the command's name, with hyphens for underscores; none in a program that is no command."""
-    return [word.replace("_", "-") for word in sys.argv[1:]] if command() else []
+    """The words after the command's name, options with hyphens for underscores; none in a program that is no
+    command."""
+    parts = [word.partition("=") if word.startswith("--") else (word, "", "") for word in sys.argv[1:]]
+    words = [(name.replace("_", "-") if name.startswith("--") else name) + sign + value for name, sign, value in parts]
+    return words if command() else []
 
 
 def values_of(option: str) -> list[str]:

@@ -109,6 +109,15 @@ def test_folders_that_are_not_there_are_named(rendered, scene, tmp_path):
         score(rendered, tmp_path / "none")
 
 
+def test_a_scene_without_test_images_is_named(rendered, scene, tmp_path):
+    meta = json.loads((scene / "transforms.json").read_text())
+    meta = {key: value for key, value in meta.items() if not key.endswith("_filenames")}
+    (tmp_path / "transforms.json").write_text(json.dumps(meta | {"frames": meta["frames"][:4]}))
+    (tmp_path / "images").symlink_to(scene / "images")
+    with pytest.raises(ValueError, match="no test images: list them as test_filenames"):
+        score(rendered, tmp_path)
+
+
 def test_the_test_images_themselves_are_not_a_rendering(scene, tests_of, tmp_path):
     for name, image in tests_of.items():
         Image.fromarray(image).save(tmp_path / f"{name}.png")

@@ -29,7 +29,6 @@ from mmpi_ns.capture.observe import (
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model, numbers_in_model
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.utils.errors import InputError
 
 SIZES = np.array([[40.0, 20.0], [80.0, 60.0]])
 
@@ -195,13 +194,6 @@ def cloud_outputs() -> Any:
         dataparser_transform=torch.eye(4)[:3],
         dataparser_scale=1.0,
     )
-
-
-def test_a_capture_without_training_images_is_refused():
-    outputs = cloud_outputs()
-    outputs.image_filenames = []
-    with pytest.raises(InputError, match="no training image"):
-        read_observations(outputs, as_data().cameras, None)
 
 
 def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkeypatch, capsys):

@@ -15,12 +15,14 @@ from nerfstudio.utils.eval_utils import eval_setup
 from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.export import bake as bake_module
 from mmpi_ns.export.bake import bake_run, compare
 from mmpi_ns.export.files import read_baked, write_baked
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering import baked as baking
+from mmpi_ns.rendering.metrics import psnr
 from mmpi_ns.rendering.rendered import bounded, shown_outputs
 from mmpi_ns.scene.baked import brick_numbers
 from mmpi_ns.scene.plan import CubePlan
@@ -201,6 +203,26 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
         assert baked["to_exact"] > 35 and abs(exact["psnr"] - baked["psnr"]) < 0.3
         assert abs(exact["ssim"] - baked["ssim"]) < 0.01 and baked["seconds"] > 0
     assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
+
+
+def test_cameras_that_train_and_are_scored_are_training_cameras(trainer, monkeypatch):
+    """As in a capture of fewer than ten images without lists; splats are fitted to training cameras."""
+    filled(trainer)
+    manager = trainer.pipeline.datamanager
+    monkeypatch.setattr(manager, "eval_dataset", manager.train_dataset)
+    path = bake_run(trainer.pipeline, 0).path
+    assert len(path) == len(manager.train_dataset) and not any(pose.test for pose in path)
+
+
+def test_see_through_test_images_are_compared_over_the_background(trainer, monkeypatch):
+    model = filled(trainer)
+    scene, dataset = bake_run(trainer.pipeline, 0), trainer.pipeline.datamanager.eval_dataset
+    shown = model.get_outputs_for_camera_ray_bundle(image_rays(dataset.cameras[:1]))["rgb"]
+    background = float(model.observed({"image": torch.zeros(1, 1, 4)}).mean())
+    hidden = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(*shown.shape[:2], 4)  # red, all see-through
+    monkeypatch.setattr(dataset, "get_data", lambda *_, **__: {"image": hidden})
+    expected = psnr(torch.full_like(shown, background), shown)
+    assert compare(trainer.pipeline, scene, 1)["exact"]["psnr"] == pytest.approx(expected, abs=1e-3)
 
 
 def test_codes_are_off_where_training_views_see_little_of_them(trainer, monkeypatch):

@@ -89,6 +89,11 @@ def test_neighbours_that_agree_become_one(window):
     assert len(few.means) == 50
 
 
+def test_a_weight_that_no_texel_has_is_refused(window):
+    with pytest.raises(ValueError, match="give a smaller --weight"):
+        splats.splats_of(window, cameras(window), 1.5, 100)
+
+
 def test_fitted_colours_come_closer_to_the_window(window):
     """Each round brings images of the splats closer to those of the bricks, also from between the cameras."""
     poses = cameras(window)

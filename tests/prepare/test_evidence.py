@@ -17,6 +17,7 @@ from mmpi_ns.prepare.evidence import (
     held_by_side,
     scale_changes,
     strides,
+    turns_explain,
 )
 from mmpi_ns.prepare.verdict import best_first, judge_alone, judge_together
 
@@ -293,3 +294,30 @@ def test_cameras_that_are_all_turned_alike_agree(sound):
     turned[:, :3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ POSES[:, :3, :3]
     difference = agreement(sound, replace(sound, poses=turned))
     assert difference is not None and difference.turns.max() < 1e-4
+
+
+def pairs_of_rays(shift, zoom=1.0, count=6):
+    """Matches of cameras that turn about y and move sideways by ``shift`` from one to the next, and their bound."""
+    g = np.random.default_rng(0)
+    points = np.c_[g.uniform(-2, 2, (200, 2)), g.uniform(3, 9, 200)]
+    rays = []
+    for i in range(count):
+        angle = 0.03 * i
+        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        x, y, z = ((points - [shift * i, 0, 0]) @ turn).T
+        rays.append(zoom * np.c_[x / z, y / z] + g.normal(0, 2e-4, (200, 2)))
+    pairs = [(rays[i], rays[j]) for i in range(count) for j in range(i + 1, count)]
+    return pairs, [2e-3] * len(pairs)
+
+
+@pytest.mark.parametrize("zoom", [0.6, 1.0, 1.7])
+def test_a_camera_that_turns_in_one_place_is_told_from_one_that_moves(zoom):
+    assert turns_explain(*pairs_of_rays(0.0, zoom))
+    assert not turns_explain(*pairs_of_rays(0.1, zoom))
+    assert not turns_explain([], [])
+
+
+def test_without_parallax_a_track_is_doubtful_though_mappers_agree(sound):
+    turning = replace(sound, only_turns=True)
+    verdict = judge_together(turning, [replace(turning, name="global")], True)
+    assert not sound.only_turns and verdict.grade == "doubtful" and "turns in one place" in verdict.says

@@ -48,6 +48,12 @@ def test_options_are_judged_before_any_work(options, words, frames, tmp_path):
     assert not (tmp_path / "scene").exists()
 
 
+def test_copies_of_no_pixel_are_refused_before_any_work(frames, tmp_path):
+    with pytest.raises(InputError, match=r"--downscales 5000 leaves no pixel of frame_00\d.png"):
+        prepare(Settings(frames, tmp_path / "scene", downscales=(2, 5000)))
+    assert not (tmp_path / "scene/transforms.json").exists()
+
+
 def test_files_that_options_name_are_read_before_any_work(frames, tmp_path):
     scene, lists = tmp_path / "scene", tmp_path / "lists.json"
     for text, words in (("{", "cannot be read"), ('{"train_filenames": []}', "test_filenames")):

@@ -342,13 +342,14 @@ def test_images_without_overlap_are_refused(tmp_path):
         prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
 
 
-def test_two_disconnected_groups_are_named_and_the_larger_can_be_had(tmp_path):
+def test_two_disconnected_groups_are_named_and_the_larger_can_be_had(tmp_path, capsys):
     corridor.write_images(tmp_path / "in", 7, seed=1)
     corridor.write_images(tmp_path / "in", 6, seed=2, start=20)
     settings = Settings(tmp_path / "in", tmp_path / "scene", threads=1)
     prepare(settings)
     report = (tmp_path / "scene/report.md").read_text()
     assert "7 of 13" in report and "6 images form a group of their own" in report and "frame_021.png" in report
+    assert "6 images form a group of their own" in " ".join(capsys.readouterr().out.split())
 
 
 def test_scene_and_input_are_kept_apart(tmp_path):

@@ -92,6 +92,7 @@ REFUSED = {
     "file is null": (frame(file_path=None), ["file_path", "number 4", "None"]),
     "file is empty": (frame(file_path=" "), ["file_path", "number 4"]),
     "file is a list": (frame(file_path=["a.png"]), ["file_path", "number 4"]),
+    "back slashes": (frame(file_path=r"images\none.png"), [r"images\none.png", "write / instead"]),
     "mask is null": (frame(mask_path=None), ["mask_path", "number 4"]),
     "one depth alone": (frame(depth_file_path="a.png"), ["has no depth_file_path and others have one"]),
     # Poses
@@ -135,6 +136,9 @@ REFUSED = {
     "unknown camera model": (file(camera_model="PINHOLE2"), ["camera_model", "'PINHOLE2'", "OPENCV_FISHEYE"]),
     "stereo camera model": (file(camera_model="VR180_L"), ["camera_model", "'VR180_L'", "OPENCV_FISHEYE"]),
     "FISHEYE624 without a lens": (file(camera_model="FISHEYE624"), ["distortion_params", "12 numbers"]),
+    "a camera model of one frame": (frame(camera_model="OPENCV_FISHEYE"), [NAME, "'OPENCV_FISHEYE'", "state it there"]),
+    "fisheye of instant-ngp": (file(is_fisheye=True), ["instant-ngp-data", "OPENCV_FISHEYE"]),
+    "an angle of instant-ngp": (file(fl_x=..., camera_angle_x=1.0), ["camera_angle_x", "no fl_x", "instant-ngp-data"]),
     "camera model is null": (file(camera_model=None), ["camera_model", "None"]),
     "k1 is NaN": (file(k1=NAN), ["distortion k1", "nan"]),
     "k2 is null": (file(k2=None), ["distortion k2", "None"]),
@@ -209,6 +213,13 @@ def test_names_that_say_no_split_are_refused_where_they_must(data, edit, tmp_pat
     assert name_of(0) in said and "neither train nor eval" in said
 
 
+def test_a_capture_without_training_images_is_refused(data, edit, tmp_path):
+    edit(lambda meta: [meta.pop(f"{split}_filenames") for split in ("train", "val", "test")])
+    options = {"eval_mode": "interval", "eval_interval": 1}
+    said = train(data, tmp_path, **{f"pipeline__datamanager__dataparser__{k}": v for k, v in options.items()}).sentence
+    assert "holds no training image" in said
+
+
 TEXTS = {
     "empty": "", "cut short": '{"frames": [', "a list": "[1, 2]", "no frames": "{}", "frames empty": '{"frames": []}',
     "frames of numbers": '{"frames": [3]}', "frames null": '{"frames": null}', "deep": "[" * 100_000,
@@ -230,6 +241,15 @@ def test_transforms_in_latin_1_are_refused(data, tmp_path):
 def test_a_folder_without_transforms_is_named_with_what_to_do(tmp_path):
     said = train(tmp_path / "nowhere", tmp_path).sentence
     assert "There is no" in said and "mmpi-prepare" in said and "colmap" in said
+
+
+def test_a_folder_without_transforms_is_told_the_parser_that_fits(data, tmp_path):
+    (data / "transforms.json").rename(data / "transforms_train.json")
+    assert "--data FOLDER blender-data)" in train(data, tmp_path).sentence
+    (data / "transforms_train.json").unlink()
+    assert "--data FOLDER colmap)" in train(data, tmp_path).sentence
+    (data / "colmap/sparse").rename(data / "sparse")
+    assert "--data FOLDER colmap --colmap-path sparse/0)" in train(data, tmp_path).sentence
 
 
 RUNS = {

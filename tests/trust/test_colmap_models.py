@@ -100,6 +100,11 @@ def test_the_colmap_parser_names_a_model_that_is_missing_or_cut_short(data, tmp_
     assert f"COLMAP model {'in' if cut_to else 'at'} {folder}" in said
 
 
+def test_the_colmap_parser_says_where_a_model_is(data, tmp_path):
+    (data / "colmap/sparse").rename(data / "sparse")
+    assert train_colmap(data, tmp_path).sentence.endswith("--colmap-path after colmap (sparse/0 holds one).")
+
+
 def test_the_colmap_parser_without_copies_asks_nobody(data, tmp_path):
     said = train_colmap(data, tmp_path, "--downscale-factor", 2).sentence
     assert f"no copies of {data / 'images'} at 1/2" in said and "there are no copies; 1 takes" in said

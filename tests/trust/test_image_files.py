@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from forked import run, train
@@ -43,6 +45,24 @@ def sixteen_bits(data):
 def test_images_of_other_kinds_among_rgb_train(data, tmp_path, odd):
     odd(data)
     assert "Training finished" in train(data, tmp_path).shown
+
+
+@pytest.mark.parametrize("ending", [".webp", ".png"])
+def test_webp_images_are_matched_whatever_their_ending(data, edit, tmp_path, ending):
+    def rename(meta):
+        for key in ("train", "val", "test"):
+            del meta[f"{key}_filenames"]
+        for frame in meta["frames"]:
+            path = data / frame["file_path"]
+            image = Image.open(path).convert("RGB")
+            path.unlink()
+            image.save(path.with_suffix(ending), format="WEBP", lossless=True)
+            frame["file_path"] = str(path.with_suffix(ending).relative_to(data))
+
+    edit(rename)
+    shutil.rmtree(data / "colmap")
+    shown = train(data, tmp_path).shown
+    assert "triangulated points" in shown and "Training finished" in shown
 
 
 def test_16_bit_pixels_become_the_nearest_of_8_bits(data):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 
 import numpy as np
 import pytest
@@ -26,7 +27,8 @@ def render(trained, tmp_path, what, *options):
     """ns-render, where something is called ffmpeg, which images need for a check alone."""
     (tmp_path / "ffmpeg").write_text("#!/bin/sh\nexit 1\n")
     (tmp_path / "ffmpeg").chmod(0o755)
-    words = ("--load-config", trained / "config.yml", "--output-path", tmp_path / "shown", *options)
+    shown = tmp_path / ("shown.mp4" if what == "camera-path" else "shown")
+    words = ("--load-config", trained / "config.yml", "--output-path", shown, *options)
     return start("ns-render", what, *words, environment={"PATH": f"{tmp_path}:{os.environ['PATH']}"}).end()
 
 
@@ -41,6 +43,65 @@ def test_ns_render_names_the_format_that_holds_what_is_transparent(trained, tmp_
     else:
         assert render(trained, tmp_path, what, "--image-format=png", *RGBA).shown
         assert Image.open(next((tmp_path / "shown/test/rgba").iterdir())).mode == "RGBA"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--frame-rate", "0"), "--frame-rate must be"),
+        (("--interpolation-steps=0",), "--interpolation-steps must be"),
+        (("--output-format", "video"), "shown says no format"),
+        (("--output-format", "images", "--downscale-factor", "500"), "0 x 0 pixels shows nothing"),
+    ],
+)
+def test_ns_render_names_what_cannot_be_rendered(trained, tmp_path, options, words):
+    assert words in render(trained, tmp_path, "interpolate", *options).sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "cannot be read"),
+        ("{", "cannot be read"),
+        ("{}", "cannot be read"),
+        ('{"render_width": 9, "render_height": 9, "seconds": 1, "camera_path": []}', "holds no camera"),
+        ('{"render_width": 9, "render_height": 9, "seconds": 0, "camera_path": [1]}', "The seconds of"),
+    ],
+)
+def test_ns_render_names_a_camera_path_that_it_cannot_follow(trained, tmp_path, text, words):
+    path = tmp_path / "my_path.json"
+    if text is not None:
+        path.write_text(text)
+    said = render(trained, tmp_path, "camera-path", "--camera-path-filename", path).sentence
+    assert str(path) in said and words in said
+
+
+def test_ns_render_takes_copies_of_a_data_set_by_their_factor(trained, whole_scene, tmp_path):
+    half = ("--split", "test", "--downscale-factor", "2")
+    assert "1/2 of its size" in render(trained, tmp_path, "dataset", *half).sentence
+    data = shutil.copytree(whole_scene, tmp_path / "data")
+    (data / "images_2").mkdir()
+    for path in (data / "images").iterdir():
+        Image.open(path).reduce(2).save(data / "images_2" / path.name)
+    assert render(trained, tmp_path, "dataset", "--data", data, *half).shown
+    shown = next((tmp_path / "shown/test/rgb").iterdir())
+    assert Image.open(shown).size == (WIDTH // 2, HEIGHT // 2)
+
+
+@pytest.mark.parametrize(("command", "end"), [(("ns-eval",), "a.json"), (("ns-render", "dataset"), "a")])
+def test_a_result_that_cannot_be_written_is_told_before_anything_is_loaded(trained, tmp_path, command, end):
+    (tmp_path / "file").write_text("")
+    config = ("--load-config", trained / "config.yml", "--output-path", tmp_path / "file" / end)
+    ended = start(*command, *config).end()
+    assert "cannot be written" in ended.sentence and "another --output-path" in ended.sentence
+    assert "loading" not in ended.out
+
+
+@pytest.mark.parametrize("name", ["scores", "scores.txt"])
+def test_ns_eval_names_a_result_that_is_no_json(trained, tmp_path, name):
+    config = ("--load-config", trained / "config.yml", "--output-path", tmp_path / name)
+    ended = start("ns-eval", *config).end()
+    assert f"{name} is no .json file" in ended.sentence and "loading" not in ended.out
 
 
 def test_ns_render_shows_the_nearest_training_image_beside_its_own(trained, tmp_path):

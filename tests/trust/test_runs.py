@@ -298,6 +298,16 @@ def test_evaluation_says_psnr_and_ssim_with_the_worst_and_the_best_image(finishe
     assert all(name_of(i) in said for i in TEST)
 
 
+def test_a_run_that_was_moved_is_evaluated_where_it_is(whole_scene, tmp_path):
+    assert train(whole_scene, tmp_path / "before").status == 0
+    (tmp_path / "before").rename(tmp_path / "after")
+    folder = tmp_path / "after/tiny/mmpi-small/run"
+    config = ("--load-config", folder / "config.yml", "--output-path", tmp_path / "eval.json")
+    shown = run("ns-eval", *config).shown
+    assert f"checkpoint from {folder}" in shown and "has no details" not in shown
+    assert not (tmp_path / "before").exists()
+
+
 def test_ns_render_without_ffmpeg_says_so_before_loading(finished, tmp_path):
     config = ("--load-config", finished / "config.yml", "--output-path", tmp_path / "film.mp4")
     ended = start("ns-render", "interpolate", *config, environment={"PATH": str(tmp_path)}).end()

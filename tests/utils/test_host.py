@@ -97,9 +97,9 @@ def test_patches_say_what_they_change_and_why():
     ],
 )
 def test_a_command_is_known_by_its_program(monkeypatch, program, name):
-    monkeypatch.setattr(sys, "argv", [program, "--viewer.websocket_host=0.0.0.0"])
+    monkeypatch.setattr(sys, "argv", [program, "--viewer.websocket_host=0.0.0.0", "--output_path", "my_path"])
     assert host.command() == name
-    assert host.arguments() == (["--viewer.websocket-host=0.0.0.0"] if name else [])
+    assert host.arguments() == (["--viewer.websocket-host=0.0.0.0", "--output-path", "my_path"] if name else [])
 
 
 def test_a_program_that_trains_with_this_package_keeps_its_own_hooks(scene, plan_file, tmp_path, mallocs):
