@@ -8,7 +8,10 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from numpy.typing import NDArray
+from torch import Tensor
 
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
@@ -83,17 +86,8 @@ class Score:
             truth, name = truths.get_data(i)["image"], truths.image_filenames[i]
             if truth.shape[-1] != 3:
                 raise ValueError(f"{name} is see-through: there is no one truth to compare with.")
-            pixels = MMPIDataset(replace(truths._dataparser_outputs, image_filenames=[file])).get_numpy_image(0)
-            if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:
-                raise ValueError(f"{file} is see-through: put it over the background that the test images have.")
-            if pixels.shape[:2] != truth.shape[:2]:
-                (height, width), (high, wide) = pixels.shape[:2], truth.shape[:2]
-                raise ValueError(
-                    f"{file} has {width} x {height} pixels and its test image {wide} x {high}: render at that size, or "
-                    "give the --downscale-factor that was rendered at."
-                )
-            colors = torch.from_numpy(pixels[..., :3].astype(np.float32) / 255)
-            scores.append((name.name, metrics(colors, truth)))
+            rendering = MMPIDataset(replace(truths._dataparser_outputs, image_filenames=[file]))
+            scores.append((name.name, metrics(colors_of(rendering.get_numpy_image(0), file, truth), truth)))
         if min(values["psnr"] for _, values in scores) > SAME_DB:
             raise ValueError(f"{self.images} holds the test images themselves: give the folder of the renderings.")
         means = {k: float(np.mean([values[k] for _, values in scores])) for k in scores[0][1]}
@@ -101,6 +95,19 @@ class Score:
         print(summary(scores) + "".join(others))
         print(PROTOCOL)
         return scores, means
+
+
+def colors_of(pixels: NDArray[np.uint8], file: Path, truth: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """Colours of a rendering. Raises ValueError where it is see-through or of another size than its test image."""
+    if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:
+        raise ValueError(f"{file} is see-through: put it over the background that the test images have.")
+    if pixels.shape[:2] != truth.shape[:2]:
+        (height, width), (high, wide) = pixels.shape[:2], truth.shape[:2]
+        raise ValueError(
+            f"{file} has {width} x {height} pixels and its test image {wide} x {high}: render at that size, or give "
+            "the --downscale-factor that was rendered at."
+        )
+    return torch.from_numpy(pixels[..., :3].astype(np.float32) / 255)
 
 
 def evenly(count: int, most: int) -> list[int]:

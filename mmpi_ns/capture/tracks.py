@@ -184,11 +184,7 @@ def triangulate(images: PosedImages) -> SfmModel:
             work, database = Path(folder) / "images", Path(folder) / "database.db"
             work.mkdir()
             for name, file, ending in zip(names, images.files, endings, strict=True):
-                if ending:
-                    os.symlink(file.resolve(), work / name)
-                    continue
-                with opened(file) as image:
-                    image.convert("L").save(work / name, compress_level=1)
+                os.symlink(file.resolve(), work / name) if ending else _convert(file, work / name)
             model = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
             sfm.write_images(model, database)
             options.sift.peak_threshold = contrast
@@ -204,6 +200,12 @@ def triangulate(images: PosedImages) -> SfmModel:
             tracks = read_reconstruction(model, MIN_TRACK)
     assert tracks is not None
     return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
+
+
+def _convert(file: Path, target: Path) -> None:
+    """Writes an image of a format that COLMAP does not read as a gray PNG."""
+    with opened(file) as image:
+        image.convert("L").save(target, compress_level=1)
 
 
 def _epipolar_error(database: Path, model: Any) -> float:

@@ -105,14 +105,7 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         ValueError: if no texel has the least weight.
     """
     texels = _texels(window, window.peaks(pose.rays() for pose in poses))
-    group, level = _merged(texels, texels.peaks >= least)
-    is_seen = group >= 0
-    if not is_seen.any():
-        raise ValueError(f"No texel has a rendering weight of {least:g} in a training view: give a smaller --weight.")
-    weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[is_seen], texels.peaks[is_seen], "amax")
-    heaviest = weight.argsort(descending=True)[:most].sort().values
-    numbers = torch.full((len(weight),), -1).index_copy(0, heaviest, torch.arange(len(heaviest)))
-    group = torch.where(is_seen, numbers[group.clamp(min=0)], -1)
+    group, level = _heaviest(texels, least, most)
     focal = fmean(pose.focal[0] for pose in poses)
     inside = (group >= 0).nonzero()[:, 0]
     group, level, total = group[inside], level[inside], int(group.max()) + 1
@@ -146,6 +139,18 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         cameras = between(poses, FRACTIONS[number % len(FRACTIONS)])
         splats = fitted(splats, window, track(cameras, description=f"Fitting splats, round {number + 1} of {rounds}"))
     return splats
+
+
+def _heaviest(texels: _Texels, least: float, most: int) -> tuple[Tensor, Tensor]:
+    """Splat of each texel (-1: none) and its level, as ``_merged``, but for all but the ``most`` of largest weight."""
+    group, level = _merged(texels, texels.peaks >= least)
+    is_seen = group >= 0
+    if not is_seen.any():
+        raise ValueError(f"No texel has a rendering weight of {least:g} in a training view: give a smaller --weight.")
+    weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[is_seen], texels.peaks[is_seen], "amax")
+    heaviest = weight.argsort(descending=True)[:most].sort().values
+    numbers = torch.full((len(weight),), -1).index_copy(0, heaviest, torch.arange(len(heaviest)))
+    return torch.where(is_seen, numbers[group.clamp(min=0)], -1), level
 
 
 def between(poses: list[Pose], fraction: float) -> list[Pose]:
