@@ -34,10 +34,10 @@ def outlined(
         others: its neighbours.
         masks: what moves in each. [h, w]
         mask: what moves in the shot. [h, w]
-        core: seeds, which stay. [h, w]
+        core: seeds, which stay; so do objects without any, which are people. [h, w]
         noise: levels by which surfaces differ from what explains them.
     """
-    unlike = least_unlike(shot, others, masks)
+    unlike, core = least_unlike(shot, others, masks), core | (mask & ~touching(mask, core))
     rows = np.arange(len(mask))[:, None]
     last = len(mask) - 1 - core[::-1].argmax(0)
     body = core | (core.any(0) & (rows >= core.argmax(0) - OVER) & (rows <= last))
