@@ -47,6 +47,30 @@ def test_what_no_neighbour_explains_joins():
     assert shown[SQUARE].mean() > 0.95 and not shown[~around].any()
 
 
+def test_another_thing_that_nothing_explains_does_not_join():
+    shot, others = a_scene()
+    for box in (np.s_[2:10, 60:75], np.s_[46:54, 35:45]):
+        shot.color[box] = textured(2)[box]
+    mask, core = in_box(SQUARE), in_box(np.s_[30:34, 38:42])
+    shown = outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)
+    assert not shown[:12].any() and not shown[50:].any()
+
+
+def test_what_is_explained_amid_something_that_moves_stays():
+    shot, others = a_scene()
+    hole = np.s_[27:33, 32:36]
+    shot.color[hole] = a_shot(0.0, np.ascontiguousarray(textured(0, (60, 120))[:, 10:90]), 0.5).color[hole]
+    mask, core = in_box(HALO), in_box(np.s_[30:34, 42:46])
+    assert outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)[hole].all()
+
+
+def test_what_lies_below_the_ground_explains_nothing():
+    shot, others = a_scene()
+    still = [np.zeros(SIZE, bool)] * 2
+    above = least_unlike(replace(shot, ground=np.full(SIZE, 2.0, np.float32)), others, still)
+    assert np.median(above[5:15, 30:50]) > np.median(least_unlike(shot, others, still)[5:15, 30:50]) + 8
+
+
 def test_nothing_changes_where_neighbours_show_nothing_but_what_moves():
     halo = in_box(HALO)
     np.testing.assert_array_equal(outline(halo, in_box(np.s_[30:34, 38:42]), hidden=True), halo)
