@@ -44,11 +44,13 @@ def outlined(
     leaves = mask & (unlike < noise + EXPLAINED) & ~body
     if shot.level is not None:
         leaves &= rows > shot.level + LEVEL
-    left = touching(_filled(_closed(mask & ~leaves)) & mask, core)
+    left = touching(_closed(mask & ~leaves) & mask, core)
     near = cv2.dilate(left.astype(np.uint8), _disc(2 * AROUND + 1)) > 0
     joins = near & (unlike > noise + UNLIKE) & (unlike < ALL)
     both = cv2.morphologyEx((left | joins).astype(np.uint8), cv2.MORPH_OPEN, _disc(OPENED)) > 0
-    return _filled(touching(both | left, left))
+    shown = _filled(touching(both | left, left))
+    # Pixels along an outline mix what is on both sides of it.
+    return shown | ((cv2.dilate(shown.astype(np.uint8), _disc(3)) > 0) & (unlike >= noise + EXPLAINED))
 
 
 def touching(mask: Mask, seeds: Mask) -> Mask:

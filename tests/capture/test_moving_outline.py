@@ -10,7 +10,7 @@ import pytest
 from test_moving_masks import SIZE, a_shot, neighbours, textured
 
 from mmpi_ns.capture.moving_evidence import least_unlike
-from mmpi_ns.capture.moving_outline import OVER, outlined, touching
+from mmpi_ns.capture.moving_outline import AROUND, OVER, outlined, touching
 
 SQUARE, HALO = np.s_[22:38, 30:50], np.s_[16:44, 24:56]
 
@@ -49,18 +49,18 @@ def test_what_no_neighbour_explains_joins():
 
 def test_another_thing_that_nothing_explains_does_not_join():
     shot, others = a_scene()
-    for box in (np.s_[2:10, 60:75], np.s_[46:54, 35:45]):
+    for box in (np.s_[47:55, 32:48], np.s_[26:34, 50:78]):  # one beside it, one that it touches
         shot.color[box] = textured(2)[box]
     mask, core = in_box(SQUARE), in_box(np.s_[30:34, 38:42])
     shown = outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)
-    assert not shown[:12].any() and not shown[50:].any()
+    assert not shown[48:].any() and shown[26:34, 50:56].mean() > 0.8 and not shown[:, 50 + AROUND + 2 :].any()
 
 
 def test_what_is_explained_amid_something_that_moves_stays():
     shot, others = a_scene()
-    hole = np.s_[27:33, 32:36]
+    hole = np.s_[25:35, 33:44]
     shot.color[hole] = a_shot(0.0, np.ascontiguousarray(textured(0, (60, 120))[:, 10:90]), 0.5).color[hole]
-    mask, core = in_box(HALO), in_box(np.s_[30:34, 42:46])
+    mask, core = in_box(HALO), in_box(np.s_[30:34, 46:49])
     assert outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)[hole].all()
 
 
@@ -71,9 +71,10 @@ def test_what_lies_below_the_ground_explains_nothing():
     assert np.median(above[5:15, 30:50]) > np.median(least_unlike(shot, others, still)[5:15, 30:50]) + 8
 
 
-def test_nothing_changes_where_neighbours_show_nothing_but_what_moves():
+def test_only_a_pixel_joins_where_neighbours_show_nothing_but_what_moves():
     halo = in_box(HALO)
-    np.testing.assert_array_equal(outline(halo, in_box(np.s_[30:34, 38:42]), hidden=True), halo)
+    wider = cv2.dilate(halo.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) > 0
+    np.testing.assert_array_equal(outline(halo, in_box(np.s_[30:34, 38:42]), hidden=True), wider)
 
 
 def test_nothing_leaves_above_the_horizon():
