@@ -151,7 +151,11 @@ def splat(shot: Shot, other: Shot) -> Map:
     shown = (ahead > 0) & (right >= 0) & (right < width * ahead) & (down >= 0) & (down < height * ahead)
     right, down, ahead, inverse = (part[shown] for part in (right, down, SPARSE * ahead, inverse))
     result = np.zeros((-(-height // SPARSE), -(-width // SPARSE)), np.float32)
-    np.maximum.at(result, ((down / ahead).astype(int), (right / ahead).astype(int)), SPARSE * inverse / ahead)
+    places = (  # a quotient may round up to the first square beyond the border
+        np.minimum((part / ahead).astype(int), squares - 1)
+        for part, squares in zip((down, right), result.shape, strict=True)
+    )
+    np.maximum.at(result, tuple(places), SPARSE * inverse / ahead)
     result = np.where(result > 0, result, cv2.dilate(result, np.ones((3, 3), np.uint8)))
     return np.repeat(np.repeat(result, SPARSE, 0), SPARSE, 1)[:height, :width]
 

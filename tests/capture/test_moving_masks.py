@@ -262,6 +262,21 @@ def test_depths_of_another_camera_land_where_they_project():
     np.testing.assert_allclose(seen[12:18, 32 + shift : 48 + shift], 0.5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("side", [0, 1])
+def test_depths_that_land_on_the_very_border_of_an_image_stay_in_it(side):
+    """A pixel is inside by its product with the depth, and its quotient may be rounded to what lies beyond."""
+    far, ahead = a_shot(0.0, textured(0), 0.0), a_shot(0.0, textured(0), 0.0)
+    pose = ahead.view.pose.copy()
+    pose[2, 3] = 1.0  # behind the other camera
+    depth, random = ahead.depth.inverse, np.random.default_rng(0)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    place, extent, middle = ((y, SIZE[0], 30), (x, SIZE[1], 40))[side]
+    behind = replace(ahead, view=replace(ahead.view, pose=pose))
+    for _ in range(300):  # q at which a pixel lands on the border: middle + (place - middle) / (1 - q) = extent
+        depth[:] = (extent - place) / (extent - middle) * (1 + random.uniform(-4e-7, 4e-7, SIZE))
+        assert splat(far, behind).shape == SIZE
+
+
 def test_the_ground_is_found_and_a_wall_is_not_ground():
     rows = np.arange(SIZE[0])[:, None] + 0.5
     ground = np.repeat(np.maximum((rows - 30) / 70 / 1.5, 0), SIZE[1], 1).astype(np.float32)
