@@ -151,7 +151,11 @@ def splat(shot: Shot, other: Shot) -> Map:
     shown = (ahead > 0) & (right >= 0) & (right < width * ahead) & (down >= 0) & (down < height * ahead)
     right, down, ahead, inverse = (part[shown] for part in (right, down, SPARSE * ahead, inverse))
     result = np.zeros((-(-height // SPARSE), -(-width // SPARSE)), np.float32)
-    np.maximum.at(result, ((down / ahead).astype(int), (right / ahead).astype(int)), SPARSE * inverse / ahead)
+    places = (  # a quotient may round up to the first square beyond the border
+        np.minimum((part / ahead).astype(int), squares - 1)
+        for part, squares in zip((down, right), result.shape, strict=True)
+    )
+    np.maximum.at(result, tuple(places), SPARSE * inverse / ahead)
     result = np.where(result > 0, result, cv2.dilate(result, np.ones((3, 3), np.uint8)))
     return np.repeat(np.repeat(result, SPARSE, 0), SPARSE, 1)[:height, :width]
 
@@ -335,3 +339,17 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     differences = two[(shot.depth.inverse > 0) & (two < ALL)]
     noise = float(np.percentile(differences, NOISE)) if len(differences) else 0.0
     return Evidence(strong, weak, behind, judged, noise)
+
+
+def least_unlike(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask]) -> Bytes:
+    """Levels by which a shot differs from the neighbour most like it, without what moves there, at the possible depth
+    that is best; ALL where none shows anything. Arguments are those of ``evidence``. [h, w]"""
+    layers = [other.with_still(mask) for other, mask in zip(others, masks, strict=True)]
+    mine, surfaces = possible_depths(shot, others)
+    result = np.full(shot.view.gray.shape, ALL, np.uint8)
+    for inverse in mine + surfaces:
+        distances, _, _ = _compare(shot, others, layers, inverse, False)
+        possible = inverse > 0 if shot.ground is None else (inverse > 0) & (inverse >= SOLID * shot.ground)
+        for distance in distances:
+            result = np.minimum(result, distance | all_where(~possible))
+    return result

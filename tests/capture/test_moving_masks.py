@@ -79,7 +79,8 @@ def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_i
 
     monkeypatch.setattr(moving, "find_depths", lambda *_: iter(shots))
     monkeypatch.setattr(moving, "_moves", moves)
-    monkeypatch.setattr(moving, "_followed_on", lambda shots, near, masks, *_: masks)
+    for name in ("_followed_on", "_outlined"):
+        monkeypatch.setattr(moving, name, lambda shots, near, masks, *_: masks)
     monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
     poses = np.tile(np.eye(4)[:3], (5, 1, 1))
     poses[:, 0, 3] = range(5)
@@ -259,6 +260,21 @@ def test_depths_of_another_camera_land_where_they_project():
     seen = splat(far, near)
     shift = round(70 * 0.4 * 0.5)
     np.testing.assert_allclose(seen[12:18, 32 + shift : 48 + shift], 0.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_depths_that_land_on_the_very_border_of_an_image_stay_in_it(side):
+    """A pixel is inside by its product with the depth, and its quotient may be rounded to what lies beyond."""
+    far, ahead = a_shot(0.0, textured(0), 0.0), a_shot(0.0, textured(0), 0.0)
+    pose = ahead.view.pose.copy()
+    pose[2, 3] = 1.0  # behind the other camera
+    depth, random = ahead.depth.inverse, np.random.default_rng(0)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    place, extent, middle = ((y, SIZE[0], 30), (x, SIZE[1], 40))[side]
+    behind = replace(ahead, view=replace(ahead.view, pose=pose))
+    for _ in range(300):  # q at which a pixel lands on the border: middle + (place - middle) / (1 - q) = extent
+        depth[:] = (extent - place) / (extent - middle) * (1 + random.uniform(-4e-7, 4e-7, SIZE))
+        assert splat(far, behind).shape == SIZE
 
 
 def test_the_ground_is_found_and_a_wall_is_not_ground():
