@@ -3,8 +3,10 @@ mover by mistake."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -175,6 +177,35 @@ def test_only_what_a_second_look_shows_by_itself_is_followed_by_flow_and_along_t
     masks = five_in_a_row(monkeypatch, [car] * 5, mistake | car, followed=followed, carried=carry)
     assert sources and all((source == car).all() for source in sources)
     assert all((mask == car | by_flow).all() for mask in masks)
+
+
+def test_outlines_are_drawn_of_all_that_was_followed(monkeypatch):
+    car, by_flow = np.zeros((2, 20, 50), bool)
+    car[:, 20:30], by_flow[:, 30:34] = True, True
+    drawn = {"followed": lambda *_: by_flow, "_outlined": lambda shots, near, masks, *_: [~mask for mask in masks]}
+    assert all((mask == ~(car | by_flow)).all() for mask in five_in_a_row(monkeypatch, [car] * 5, car, **drawn))
+
+
+def test_only_images_that_were_looked_at_again_get_another_outline(monkeypatch):
+    """Each against its neighbours, without what moves there."""
+    masks = [np.full((2, 2), i < 4) for i in range(5)]
+    unused: Any = None
+    evidence: Any = SimpleNamespace(noise=2.5)
+    looks = {i: moving._Look([], unused, unused, unused, evidence, np.eye(2) > i) for i in (1, 3, 4)}
+    near = [[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]]
+    shots: Any = range(5)
+    asked = []
+
+    def outlined(shot, others, around, mask, core, noise):
+        asked.append((shot, others, [bool(m.all()) for m in around], bool((core == (np.eye(2) > shot)).all()), noise))
+        return ~mask
+
+    monkeypatch.setattr(moving, "outlined", outlined)
+    monkeypatch.setattr(moving, "_others", lambda shots, near, i, gains: near)
+    with ThreadPoolExecutor(1) as pool:
+        result = moving._outlined(shots, near, masks, looks, pool)
+    assert [bool(mask.all()) for mask in result] == [True, False, True, False, False]
+    assert asked == [(1, [0, 2], [True, True], True, 2.5), (3, [2, 4], [True, False], True, 2.5)]
 
 
 def test_an_object_regrows_with_all_its_seeds_and_loses_nothing(monkeypatch):
