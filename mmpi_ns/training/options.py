@@ -112,8 +112,8 @@ def check_nothing_left(model: Any) -> None:
 def folder_beside_config(config: TrainerConfig, folder: Path) -> Path:
     """The folder of a run's checkpoints: beside the config.yml that the command was given where the one that it names
     is gone, as the run was moved. Its windows are looked for there too."""
-    for given in values_of("--load-config") if command() in LOAD_RUNS and not folder.is_dir() else ():
-        moved = Path(given).absolute().parent / config.relative_model_dir
+    for config_file in values_of("--load-config") if command() in LOAD_RUNS and not folder.is_dir() else ():
+        moved = Path(config_file).absolute().parent / config.relative_model_dir
         if moved.is_dir():
             model: Any = config.pipeline.model
             model.windows_folder = moved.parent / model.windows_folder.name
