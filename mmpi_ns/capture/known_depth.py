@@ -296,9 +296,11 @@ def of_cells(observations: Observations, depths: KnownDepth, dataset: MMPIDatase
     cells = np.concatenate(points)
     if not len(cells):
         return observations
-    kept = len(observations.seen_at)
-    kept = 0 if kept > MOST_KEYPOINTS * len(cells) else kept
-    observations = observations.with_keypoints(np.arange(len(observations.seen_by)) < kept)
+    tracked = len(observations.seen_at)
+    stays = 0 < tracked <= MOST_KEYPOINTS * len(cells)
+    observations = observations.with_keypoints(np.arange(len(observations.seen_by)) < stays * tracked)
+    if not stays:
+        observations = replace(observations, points=cells[:0])
     return replace(
         observations,
         points=np.concatenate([observations.points, cells]),

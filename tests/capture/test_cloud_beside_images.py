@@ -45,7 +45,7 @@ def test_points_of_a_cloud_are_depths_of_pixels_and_keypoints(without, tmp_path,
     distance = np.linalg.norm(seen.points[seen.seen_point[tracked]] - seen.centers[seen.seen_by[tracked]], axis=-1)
     stored = np.stack([manager.known_depth.image(i) for i in range(6)])[seen.seen_by[tracked], rows, columns, 0]
     assert (np.abs(stored * distance - 1) < 0.05).all()  # two points may share a pixel: the nearer stays
-    assert manager.known_depth.share > without.known_depth.share + 0.1
+    assert manager.known_depth.share > without.known_depth.share
     placed, cells = (m.train_dataset.metadata[OBSERVATIONS] for m in (manager, without))
     assert len(placed.seen_by) > len(cells.seen_by)
 
