@@ -65,6 +65,15 @@ def _copy_kernels(source: Path, target: Path) -> None:
 
 
 @pytest.fixture
+def three_threads():
+    """Torch, and with it the compiled operations, share their work among three threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def plan() -> ScenePlan:
     """Two MPIs that overlap, and a cube."""
     side = make_mpi("left", (2.0, 0.0, 3.0), ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)), near=2.0)

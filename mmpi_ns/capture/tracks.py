@@ -205,7 +205,8 @@ def triangulate(images: PosedImages) -> SfmModel:
 def _convert(file: Path, target: Path) -> None:
     """Writes an image of a format that COLMAP does not read as a gray PNG."""
     with opened(file) as image:
-        image.convert("L").save(target, compress_level=1)
+        gray = image.convert("L")
+    gray.save(target, compress_level=1)
 
 
 def _epipolar_error(database: Path, model: Any) -> float:

@@ -268,8 +268,7 @@ def test_depths_that_land_on_the_very_border_of_an_image_stay_in_it(side):
     pose = ahead.view.pose.copy()
     pose[2, 3] = 1.0  # behind the other camera
     depth, random = ahead.depth.inverse, np.random.default_rng(0)
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
-    place, extent, middle = ((y, SIZE[0], 30), (x, SIZE[1], 40))[side]
+    place, extent, middle = (np.mgrid[: SIZE[0], : SIZE[1]] + 0.5)[side], SIZE[side], SIZE[side] // 2
     behind = replace(ahead, view=replace(ahead.view, pose=pose))
     for _ in range(300):  # q at which a pixel lands on the border: middle + (place - middle) / (1 - q) = extent
         depth[:] = (extent - place) / (extent - middle) * (1 + random.uniform(-4e-7, 4e-7, SIZE))

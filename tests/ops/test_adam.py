@@ -234,14 +234,6 @@ def test_adam_on_rows_equals_the_plain_one_to_the_last_bits(channels):
         assert (off <= 4e-6 * (1 + b.abs())).float().mean() > 0.995 and (off <= 2**-7 * b.abs() + 1e-3).all()
 
 
-@pytest.fixture
-def three_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(before)
-
-
 def test_steps_that_are_left_to_other_threads_have_the_same_bits(compiled, three_threads):  # noqa: F811
     def trained(threads):
         torch.set_num_threads(threads)

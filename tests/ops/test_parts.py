@@ -45,14 +45,6 @@ def test_several_callers_at_once_each_get_their_own():
         assert all(pool.map(lambda seed: taken(1 + seed % 4, seed), range(400)))
 
 
-@pytest.fixture
-def three_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(before)
-
-
 ROWS = 20_000
 LONG = 1_000_000
 """Rows that take some 20 ms."""

@@ -110,14 +110,9 @@ class Crew {
     bool is_forked() const { return process && process != getpid(); }
 
     void wake(int64_t helpers) {
-        {
-            const std::lock_guard<std::mutex> held(lock);
-            for (process = getpid(); threads < helpers; threads++) std::thread([this] { live(); }).detach();
-        }
-        if (asleep.load()) {
-            const std::lock_guard<std::mutex> held(lock);
-            work.notify_all();
-        }
+        const std::lock_guard<std::mutex> held(lock);
+        for (process = getpid(); threads < helpers; threads++) std::thread([this] { live(); }).detach();
+        if (asleep.load()) work.notify_all();
     }
 
   public:
