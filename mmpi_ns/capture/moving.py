@@ -3,8 +3,8 @@
 Every image is compared with its neighbours at reduced size (``moving_evidence.py``), also at depths that only something
 that moves can seem to have (``moving_sweep.py``); what is left over grows to objects (``moving_objects.py``). A second
 look near images in which something moves does without what moves in them, and only what it shows by itself is followed
-to other images. Of a video, key images are compared with each other, and the images between them only where something
-moves near them.
+to other images; outlines are drawn anew at the end (``moving_outline.py``). Of a video, key images are compared with
+each other, and the images between them only where something moves near them.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from mmpi_ns.capture.moving_doubt import doubt_of
 from mmpi_ns.capture.moving_evidence import Evidence, Mask, Neighbour, Shot, evidence, ground_of
 from mmpi_ns.capture.moving_follow import upright_objects
 from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
+from mmpi_ns.capture.moving_outline import outlined
 from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import has_detector, horizon_of, people_in
@@ -65,7 +66,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 16
+VERSION = 17
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -119,7 +120,7 @@ def find_moving(
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
         looks = {i: look for i, (_, look) in zip(again, second, strict=True)}
-        masks = _followed_on(shots, near, masks, looks, pool)
+        masks = _outlined(shots, near, _followed_on(shots, near, masks, looks, pool), looks, pool)
     # Whatever moves comes close at some time; what is found where nothing moves is mostly small. Walkers may stay away.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         walkers = {i: seen.walkers for i, seen in first.items() if seen.walkers.any()}
@@ -282,13 +283,20 @@ class _Look:
     """What moves for certain, of which objects grow. [h, w]"""
 
 
+def _others(
+    shots: Sequence[Shot], near: Sequence[int], i: int, gains: Sequence[NDArray[np.float64]]
+) -> list[Neighbour]:
+    """The neighbours of an image, at its exposure."""
+    return [Neighbour.of(shots[i], shots[j], gain) for j, gain in zip(near, gains, strict=True)]
+
+
 def _moves(
     shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], uprights: Mask, first: _Look | None
 ) -> tuple[Mask, _Look]:
     """What an image itself shows to move, if it is known what moves in others and where it shows people of theirs."""
     shot = shots[i]
     gains = first.gains if first else [gain_of(shot, shots[j]) for j in near]
-    others = [Neighbour.of(shot, shots[j], gain) for j, gain in zip(near, gains, strict=True)]
+    others = _others(shots, near, i, gains)
     swept = first.swept if first else sweep(shot, others)
     levels = first.levels if first else np.full(uprights.shape, UNASKED, np.int16)
     shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
@@ -309,7 +317,8 @@ def _followed_on(
     pool: ThreadPoolExecutor,
 ) -> list[Mask]:
     """Masks [h, w] with what is followed from them to the images that were looked at again: by optical flow and along
-    the path, and on along it from image to image where objects enter or leave images at the side."""
+    the path, and on along it from image to image where objects enter or leave images at the side. What is followed
+    joins the seeds in ``looks``."""
 
     def followed_to(part: Iterable[int], some_of: Callable[[int], Mask]) -> list[Mask]:
         def whole(i: int) -> Mask:
@@ -333,8 +342,7 @@ def _followed_on(
         return result
 
     def along_path(i: int) -> Carried:
-        gains = looks[i].gains
-        others = [Neighbour.of(shots[i], shots[j], gain) for j, gain in zip(near[i], gains, strict=True)]
+        others = _others(shots, near[i], i, looks[i].gains)
         return carried(shots[i], others, [masks[j] for j in near[i]], masks[i])
 
     def everywhere(i: int) -> Mask:
@@ -347,3 +355,21 @@ def _followed_on(
         part, before = [i for i in looks if any(aside[j] for j in near[i][:AFTER])], masks
         masks = followed_to(part, lambda i: along_path(i).objects)
     return masks
+
+
+def _outlined(
+    shots: Sequence[Shot],
+    near: Sequence[Sequence[int]],
+    masks: Sequence[Mask],
+    looks: dict[int, _Look],
+    pool: ThreadPoolExecutor,
+) -> list[Mask]:
+    """Masks [h, w] with better outlines, in the images that were looked at again."""
+
+    def outline(i: int) -> Mask:
+        others = _others(shots, near[i], i, looks[i].gains)
+        return outlined(shots[i], others, [masks[j] for j in near[i]], masks[i], looks[i].core, looks[i].shown.noise)
+
+    part = [i for i in looks if masks[i].any()]
+    better = dict(zip(part, pool.map(outline, part), strict=True))
+    return [better.get(i, mask) for i, mask in enumerate(masks)]

@@ -339,3 +339,17 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     differences = two[(shot.depth.inverse > 0) & (two < ALL)]
     noise = float(np.percentile(differences, NOISE)) if len(differences) else 0.0
     return Evidence(strong, weak, behind, judged, noise)
+
+
+def least_unlike(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask]) -> Bytes:
+    """Levels by which a shot differs from the neighbour most like it, without what moves there, at the possible depth
+    that is best; ALL where none shows anything. Arguments are those of ``evidence``. [h, w]"""
+    layers = [other.with_still(mask) for other, mask in zip(others, masks, strict=True)]
+    mine, surfaces = possible_depths(shot, others)
+    result = np.full(shot.view.gray.shape, ALL, np.uint8)
+    for inverse in mine + surfaces:
+        distances, _, _ = _compare(shot, others, layers, inverse, False)
+        possible = inverse > 0 if shot.ground is None else (inverse > 0) & (inverse >= SOLID * shot.ground)
+        for distance in distances:
+            result = np.minimum(result, distance | all_where(~possible))
+    return result

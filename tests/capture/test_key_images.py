@@ -64,7 +64,8 @@ def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatc
 
     monkeypatch.setattr(moving, "find_depths", depths)
     monkeypatch.setattr(moving, "_moves", moves)
-    monkeypatch.setattr(moving, "_followed_on", lambda shots, near, masks, *_: masks)
+    for name in ("_followed_on", "_outlined"):
+        monkeypatch.setattr(moving, name, lambda shots, near, masks, *_: masks)
     monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
     _, masks, _ = find_moving(aside(*np.arange(49) * 0.0099), lambda i: wall())
     assert compared == [list(range(0, 49, 2))]

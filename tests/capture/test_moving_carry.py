@@ -3,15 +3,17 @@ mover by mistake."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.capture import moving, moving_objects
+from mmpi_ns.capture import moving, moving_carry, moving_objects
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving import reaches_side
 from mmpi_ns.capture.moving_carry import Carried, carried, whole_objects
@@ -108,6 +110,17 @@ def test_a_car_without_texture_is_taken_as_a_whole():
     assert not whole_objects(scattered & car & (np.arange(120) < 6), horizon_at_30, nothing).any()  # too small
 
 
+def test_seeds_of_whole_objects_lie_far_inside(monkeypatch):
+    """They are closed across what does not seem to move."""
+    shot, others, _, masks = a_path(1.0)
+    box = np.zeros((SIZE[0] // 2, SIZE[1] // 2), bool)
+    box[20:60, 30:90] = True
+    monkeypatch.setattr(moving_carry, "whole_objects", lambda *_: box)
+    objects = carried(shot, others, [boxes[0] for boxes in masks], np.zeros(SIZE, bool)).objects
+    rows, columns = (np.nonzero(objects.any(axis))[0][[0, -1]].tolist() for axis in (1, 0))
+    assert (rows, columns) == ([40 + 9, 119 - 9], [60 + 9, 179 - 9])
+
+
 def test_images_next_to_what_is_newly_masked_at_a_side_are_looked_at_again():
     side, middle, strip = np.zeros((3, 80, 160), bool)
     side[20:60, :10], middle[20:60, 60:100], strip[20:22, -10:] = True, True, True
@@ -129,6 +142,7 @@ def five_in_a_row(monkeypatch, second: list[np.ndarray], first: np.ndarray, **pa
 
     replaced = {
         "find_depths": lambda *_: iter(shots), "people_in": lambda *_: np.zeros((0, 4), int), "_moves": moves,
+        "_outlined": lambda shots, near, masks, *_: masks,
         "neighbours": lambda images, i, keys: [j for j in (i - 1, i + 1) if 0 <= j < 5],
         "num_threads": lambda: 1,
         "is_static": lambda shot, shown: np.zeros(shape, bool), "grown": lambda shot, shown, core: core,
@@ -174,6 +188,35 @@ def test_only_what_a_second_look_shows_by_itself_is_followed_by_flow_and_along_t
     masks = five_in_a_row(monkeypatch, [car] * 5, mistake | car, followed=followed, carried=carry)
     assert sources and all((source == car).all() for source in sources)
     assert all((mask == car | by_flow).all() for mask in masks)
+
+
+def test_outlines_are_drawn_of_all_that_was_followed(monkeypatch):
+    car, by_flow = np.zeros((2, 20, 50), bool)
+    car[:, 20:30], by_flow[:, 30:34] = True, True
+    drawn = {"followed": lambda *_: by_flow, "_outlined": lambda shots, near, masks, *_: [~mask for mask in masks]}
+    assert all((mask == ~(car | by_flow)).all() for mask in five_in_a_row(monkeypatch, [car] * 5, car, **drawn))
+
+
+def test_only_images_that_were_looked_at_again_get_another_outline(monkeypatch):
+    """Each against its neighbours, without what moves there."""
+    masks = [np.full((2, 2), i < 4) for i in range(5)]
+    unused: Any = None
+    evidence: Any = SimpleNamespace(noise=2.5)
+    looks = {i: moving._Look([], unused, unused, unused, evidence, np.eye(2) > i) for i in (1, 3, 4)}
+    near = [[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]]
+    shots: Any = range(5)
+    asked = []
+
+    def outlined(shot, others, around, mask, core, noise):
+        asked.append((shot, others, [bool(m.all()) for m in around], bool((core == (np.eye(2) > shot)).all()), noise))
+        return ~mask
+
+    monkeypatch.setattr(moving, "outlined", outlined)
+    monkeypatch.setattr(moving, "_others", lambda shots, near, i, gains: near)
+    with ThreadPoolExecutor(1) as pool:
+        result = moving._outlined(shots, near, masks, looks, pool)
+    assert [bool(mask.all()) for mask in result] == [True, False, True, False, False]
+    assert asked == [(1, [0, 2], [True, True], True, 2.5), (3, [2, 4], [True, False], True, 2.5)]
 
 
 def test_an_object_regrows_with_all_its_seeds_and_loses_nothing(monkeypatch):

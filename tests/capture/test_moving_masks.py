@@ -79,7 +79,8 @@ def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_i
 
     monkeypatch.setattr(moving, "find_depths", lambda *_: iter(shots))
     monkeypatch.setattr(moving, "_moves", moves)
-    monkeypatch.setattr(moving, "_followed_on", lambda shots, near, masks, *_: masks)
+    for name in ("_followed_on", "_outlined"):
+        monkeypatch.setattr(moving, name, lambda shots, near, masks, *_: masks)
     monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
     poses = np.tile(np.eye(4)[:3], (5, 1, 1))
     poses[:, 0, 3] = range(5)
