@@ -38,8 +38,6 @@ COHERENT = 1.1
 SCATTERED, CLOSED, LEAST_PIXELS = 3.0, 13, 450
 """The same within a whole object, pixels across which what moves there is one, and those of an object, at half the
 size."""
-DEEP = 19
-"""Pixels across which an object must move for its middle to be a seed, at the size of the shot."""
 NEW, UP = 0.5, 0.2
 """Share of an object that is masked already, at most, for it to be another one; and how far below the horizon its
 highest pixel lies, over its lowest, at most: what moves by the camera is nearly as high as it."""
@@ -89,9 +87,8 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], mask
     enlarged = (
         cv2.resize(part.astype(np.uint8), nothing.shape[::-1], interpolation=cv2.INTER_NEAREST) for part in parts
     )
-    # Windows reach beyond what moves, and objects that are closed even further.
-    kernels = (np.ones((across, across), np.uint8) for across in (INSIDE, DEEP))
-    return Carried(*(cv2.erode(part, kernel) > 0 for part, kernel in zip(enlarged, kernels, strict=True)))
+    # Windows reach beyond what moves.
+    return Carried(*(cv2.erode(part, np.ones((INSIDE, INSIDE), np.uint8)) > 0 for part in enlarged))
 
 
 def whole_objects(moves: Mask, ground: Map, masked: Mask) -> Mask:
