@@ -9,7 +9,7 @@ or if an impossible depth explains it (``moving_sweep.py``).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -341,15 +341,16 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     return Evidence(strong, weak, behind, judged, noise)
 
 
-def least_unlike(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask]) -> Bytes:
+def least_unlike(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], box: tuple[slice, slice]) -> Bytes:
     """Levels by which a shot differs from the neighbour most like it, without what moves there, at the possible depth
-    that is best; ALL where none shows anything. Arguments are those of ``evidence``. [h, w]"""
+    that is best; ALL where none shows anything, and outside of a box. Other arguments are those of ``evidence``.
+    [h, w]"""
     layers = [other.with_still(mask) for other, mask in zip(others, masks, strict=True)]
     mine, surfaces = possible_depths(shot, others)
-    result = np.full(shot.view.gray.shape, ALL, np.uint8)
-    for inverse in mine + surfaces:
-        distances, _, _ = _compare(shot, others, layers, inverse, False)
-        possible = inverse > 0 if shot.ground is None else (inverse > 0) & (inverse >= SOLID * shot.ground)
-        for distance in distances:
-            result = np.minimum(result, distance | all_where(~possible))
+    part, result = replace(shot, color=shot.color[box]), np.full(shot.view.gray.shape, ALL, np.uint8)
+    others = [replace(o, warp=replace(o.warp, far=[far[box] for far in o.warp.far])) for o in others]
+    for inverse in (each[box] for each in mine + surfaces):
+        possible = inverse > 0 if shot.ground is None else (inverse > 0) & (inverse >= SOLID * shot.ground[box])
+        for distance in _compare(part, others, layers, inverse, False)[0]:
+            result[box] = np.minimum(result[box], distance | all_where(~possible))
     return result

@@ -22,6 +22,8 @@ OVER, LEVEL = 8, 3
 of what is as high as the camera stand before what hardly shifts from image to image."""
 CLOSED, OPENED, AROUND = 5, 3, 9
 """Pixels across which what is left is closed and what joins is opened, and around a mask in which it may lie."""
+REACH = AROUND + 8
+"""Pixels around all masks of an image in which it is compared: what joins, a pixel of margin, and windows."""
 
 
 def outlined(
@@ -37,7 +39,9 @@ def outlined(
         core: seeds, which stay; so do objects without any, which are people. [h, w]
         noise: levels by which surfaces differ from what explains them.
     """
-    unlike, core = least_unlike(shot, others, masks), core | (mask & ~touching(mask, core))
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    box = np.s_[max(y - REACH, 0) : y + height + REACH, max(x - REACH, 0) : x + width + REACH]
+    unlike, core = least_unlike(shot, others, masks, box), core | (mask & ~touching(mask, core))
     rows = np.arange(len(mask))[:, None]
     last = len(mask) - 1 - core[::-1].argmax(0)
     body = core | (core.any(0) & (rows >= core.argmax(0) - OVER) & (rows <= last))

@@ -12,6 +12,7 @@ from test_moving_masks import SIZE, a_shot, neighbours, textured
 from mmpi_ns.capture.moving_evidence import least_unlike
 from mmpi_ns.capture.moving_outline import AROUND, OVER, outlined, touching
 
+EVERYWHERE = np.s_[0 : SIZE[0], 0 : SIZE[1]]
 SQUARE, HALO = np.s_[22:38, 30:50], np.s_[16:44, 24:56]
 
 
@@ -67,8 +68,8 @@ def test_what_is_explained_amid_something_that_moves_stays():
 def test_what_lies_below_the_ground_explains_nothing():
     shot, others = a_scene()
     still = [np.zeros(SIZE, bool)] * 2
-    above = least_unlike(replace(shot, ground=np.full(SIZE, 2.0, np.float32)), others, still)
-    assert np.median(above[5:15, 30:50]) > np.median(least_unlike(shot, others, still)[5:15, 30:50]) + 8
+    above = least_unlike(replace(shot, ground=np.full(SIZE, 2.0, np.float32)), others, still, EVERYWHERE)
+    assert np.median(above[5:15, 30:50]) > np.median(least_unlike(shot, others, still, EVERYWHERE)[5:15, 30:50]) + 8
 
 
 def test_only_a_pixel_joins_where_neighbours_show_nothing_but_what_moves():
@@ -97,10 +98,24 @@ def test_people_without_seeds_stay(box):
 def test_what_moves_in_a_neighbour_explains_nothing():
     shot, others = a_scene()
     nothing, everything = np.zeros(SIZE, bool), np.ones(SIZE, bool)
-    both = least_unlike(shot, others, [nothing, nothing])
+    both = least_unlike(shot, others, [nothing, nothing], EVERYWHERE)
     assert np.median(both[5:15, 20:60]) < 4 and np.median(both[26:34, 34:46]) > 12
-    one = least_unlike(shot, others, [nothing, everything])
-    assert (one >= both).all() and (least_unlike(shot, others, [everything] * 2) == 255).all()
+    one = least_unlike(shot, others, [nothing, everything], EVERYWHERE)
+    assert (one >= both).all() and (least_unlike(shot, others, [everything] * 2, EVERYWHERE) == 255).all()
+
+
+@pytest.mark.parametrize("box", [HALO, np.s_[0:9, 0:7], np.s_[51:60, 70:80]])
+def test_a_box_says_the_same_as_the_whole_image(box):
+    """But at its border, where windows reach beyond it, unless the image ends there, too."""
+    shot, others = a_scene()
+    shot = replace(shot, ground=np.full(SIZE, 0.1, np.float32))
+    moves = [in_box(np.s_[10:30, 10:30]), in_box(np.s_[20:50, 40:44])]
+    whole, part = (least_unlike(shot, others, moves, each) for each in (EVERYWHERE, box))
+    inner = tuple(
+        slice(s.start + 3 * (s.start > 0), s.stop - 3 * (s.stop < size)) for s, size in zip(box, SIZE, strict=True)
+    )
+    np.testing.assert_array_equal(part[inner], whole[inner])
+    assert (part[~in_box(box)] == 255).all()
 
 
 def test_parts_without_seeds_do_not_touch_any():
