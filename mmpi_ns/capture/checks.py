@@ -119,14 +119,6 @@ def colmap_models(folder: Path) -> list[str]:
     ]
 
 
-def _parser_of(folder: Path) -> str:
-    """A data parser for a folder without transforms.json, by what is there, as it is named on the command line."""
-    if (folder / "transforms_train.json").is_file():
-        return "blender-data"
-    model = next(iter(colmap_models(folder)), "colmap/sparse/0")
-    return "colmap" if model == "colmap/sparse/0" else f"colmap --colmap-path {model}"
-
-
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if not path.is_file() and command() in LOAD_RUNS:
         how = "in the run's config.yml (data, under pipeline.datamanager)"
@@ -139,7 +131,9 @@ def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
             f"was started: start the command there, or give the whole path {how}."
         )
     if not path.is_file():
-        parser = _parser_of(path.parent)
+        model = next(iter(colmap_models(path.parent)), "colmap/sparse/0")
+        parser = "colmap" if model == "colmap/sparse/0" else f"colmap --colmap-path {model}"
+        parser = "blender-data" if (path.parent / "transforms_train.json").is_file() else parser
         raise InputError(
             f"There is no {looked_at(path)}: check --data, make one with mmpi-prepare, or name the data parser of "
             f"another format after the options (for example: ns-train mmpi-small --data FOLDER {parser})."

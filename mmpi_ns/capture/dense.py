@@ -28,7 +28,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from mmpi_ns.capture.patches import search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid, strips
+from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
 from mmpi_ns.ops.motion import find_motion
 from mmpi_ns.scene.near_views import nearest_views
@@ -127,18 +127,15 @@ def measure(view: View, neighbour: View, start: Map, flow: Flow, of_view: tuple[
 def mean_and_contrast(image: NDArray[np.uint8]) -> tuple[Map, Map]:
     """Mean and standard deviation in a window about each pixel of an image."""
     mean, contrast = _mean(image), _mean(image, squared=True)
-    for rows in strips(image.shape):
-        contrast[rows] -= mean[rows] * mean[rows]
-        np.sqrt(np.maximum(contrast[rows], 0, out=contrast[rows]), out=contrast[rows])
-    return mean, contrast
+    contrast -= mean * mean
+    return mean, np.sqrt(np.maximum(contrast, 0, out=contrast), out=contrast)
 
 
 def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8], of_a: tuple[Map, Map]) -> Map:
     """Normalised correlation of two images in a window about each pixel, by ``mean_and_contrast`` of the first."""
     of_b, alike = mean_and_contrast(b), _mean(np.asarray(cv2.multiply(a, b, dtype=cv2.CV_16U)))
-    for rows in strips(a.shape):
-        alike[rows] -= of_a[0][rows] * of_b[0][rows]
-        alike[rows] /= np.maximum(of_a[1][rows], 1) * np.maximum(of_b[1][rows], 1)
+    alike -= of_a[0] * of_b[0]
+    alike /= np.maximum(of_a[1], 1) * np.maximum(of_b[1], 1)
     return alike
 
 
@@ -153,13 +150,8 @@ def fuse(inverse: Sequence[Map], weight: Sequence[Map]) -> Depth:
 
     Weights are one over squared errors, 0 without a measurement.
     """
-    depth = Depth(*np.empty((2, *inverse[0].shape), np.float32))
-    for rows in strips(inverse[0].shape):
-        q, certainty = (torch.from_numpy(np.stack([x[rows] for x in each])) for each in (inverse, weight))
-        averaged = average_matches(q, certainty, MAX_RELATIVE)
-        for values, average in zip((depth.inverse, depth.error), averaged, strict=True):
-            values[rows] = average.numpy()
-    return depth
+    q, certainty = (torch.from_numpy(np.stack(each)) for each in (inverse, weight))
+    return Depth(*(x.numpy() for x in average_matches(q, certainty, MAX_RELATIVE)))
 
 
 def find_depths(

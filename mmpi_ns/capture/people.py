@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from mmpi_ns.capture.checks import say_once
@@ -74,38 +74,31 @@ def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) 
     first, last = (int(np.clip(level + share * width, 0, height)) for share in (-ABOVE, BELOW))
     if last <= first:
         return nobody
-    rows = cv2.resize(wide.gray[first:last], None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
-    windows = _windows(np.asarray(rows, np.uint8), scale * (horizon[[0, -1]] * height / view.gray.shape[0] - first))
+    gray = cv2.resize(wide.gray[first:last], None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
+    ends = scale * (horizon[[0, -1]] * height / view.gray.shape[0] - first)  # of the horizon, in these rows
+    detector = cv2.HOGDescriptor()
+    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
+    size, placed, scores = detector.winSize, [np.zeros((0, 4))], [np.zeros(0)]
+    for power in range(LEVELS):  # of each size only the rows that people have in whose height the camera stands
+        shrink = FINER**power
+        shape = round(gray.shape[1] / shrink), round(gray.shape[0] / shrink)
+        if shape[0] < size[0] or shape[1] < size[1]:
+            break
+        top = max(0, round(ends.min() / shrink - (1 - HEIGHTS[0]) * TALL - SPARE) // CELL * CELL)
+        bottom = max(0, round(ends.max() / shrink + HEIGHTS[1] * TALL + SPARE))
+        part = cv2.resize(gray, shape, interpolation=cv2.INTER_LINEAR_EXACT)[top:bottom]
+        corners, of_level = detector.detect(part, winStride=(CELL, CELL)) if len(part) >= size[1] else ((), ())
+        if len(corners):
+            boxes = np.insert(np.asarray(corners), [2, 2], size, 1)
+            placed.append(np.round((boxes + np.array([0, top, 0, 0])) * shrink))
+            scores.append(np.ravel(of_level))
+    every, score = np.concatenate(placed).astype(int), np.concatenate(scores)
+    grouped = np.reshape(cv2.groupRectangles(every.tolist(), 1, ALIKE)[0], (-1, 4)).astype(np.float64)
+    alike = np.abs(every - grouped[:, None]).max(-1) <= ALIKE * grouped[:, 2:].mean(-1)[:, None]
+    windows = grouped[np.where(alike, score, 0).max(-1, initial=0) > SCORE]  # left, top, width and height
     low, extent = windows[:, :2] + MARGIN * windows[:, 2:], (1 - 2 * MARGIN) * windows[:, 2:]
     boxes = (np.concatenate([low, low + extent], -1) / scale + [0, first, 0, first]) * view.gray.shape[0] / height
     camera = (boxes[:, 3] - np.interp(boxes[:, [0, 2]].mean(1), np.arange(len(horizon)) + 0.5, horizon)) / (
         boxes[:, 3] - boxes[:, 1]
     )
     return boxes[(camera > HEIGHTS[0]) & (camera < HEIGHTS[1])].round().astype(int)
-
-
-def _windows(gray: UInt8[ndarray, "H W"], horizon: Float[ndarray, "2"]) -> Float[ndarray, "N 4"]:
-    """Left, top, width and height of the detector's windows around people; the horizon ends at these rows.
-
-    Of each size only the rows are searched that people have in whose height the camera stands.
-    """
-    detector = cv2.HOGDescriptor()
-    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
-    size, windows, scores = detector.winSize, [np.zeros((0, 4))], [np.zeros(0)]
-    for power in range(LEVELS):
-        shrink = FINER**power
-        shape = round(gray.shape[1] / shrink), round(gray.shape[0] / shrink)
-        if shape[0] < size[0] or shape[1] < size[1]:
-            break
-        top = max(0, round(horizon.min() / shrink - (1 - HEIGHTS[0]) * TALL - SPARE) // CELL * CELL)
-        bottom = max(0, round(horizon.max() / shrink + HEIGHTS[1] * TALL + SPARE))
-        part = cv2.resize(gray, shape, interpolation=cv2.INTER_LINEAR_EXACT)[top:bottom]
-        corners, of_level = detector.detect(part, winStride=(CELL, CELL)) if len(part) >= size[1] else ((), ())
-        if len(corners):
-            boxes = np.insert(np.asarray(corners), [2, 2], size, 1)
-            windows.append(np.round((boxes + np.array([0, top, 0, 0])) * shrink))
-            scores.append(np.ravel(of_level))
-    every, score = np.concatenate(windows).astype(int), np.concatenate(scores)
-    grouped = np.reshape(cv2.groupRectangles(every.tolist(), 1, ALIKE)[0], (-1, 4)).astype(np.float64)
-    alike = np.abs(every - grouped[:, None]).max(-1) <= ALIKE * grouped[:, 2:].mean(-1)[:, None]
-    return grouped[np.where(alike, score, 0).max(-1, initial=0) > SCORE]

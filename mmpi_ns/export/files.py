@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import json
 import math
-import struct
 import zlib
 from bisect import bisect_right
 from dataclasses import dataclass
@@ -37,8 +36,6 @@ from mmpi_ns.utils.parallel import in_order
 
 FORMAT, VERSION = "mmpi-baked", 4
 HEADER = "scene.json"
-BLOCK = 1 << 20
-"""Bytes that one thread compresses at a time."""
 EARLY = 0.1
 """Share of a window's bytes that come first: coarse texels of the bricks that training views see most of."""
 PARTS_OF_VIEW = ("difference", "inverse")
@@ -222,20 +219,10 @@ def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
 
 
 def _gzip(array: NDArray[Any]) -> bytes:
-    """A gzip file, compressed in blocks on all threads; their number does not change a byte. Each block ends at a full
-    byte and refers to none before it, so the blocks together are one stream."""
-
-    data = np.ascontiguousarray(array).tobytes()
-
-    def compress(start: int) -> bytes:
-        # Runs and frequent bytes alone: of differences that are mostly 0, other repetitions cost more than they save.
-        packer = zlib.compressobj(6, zlib.DEFLATED, -15, 9, zlib.Z_RLE)
-        ends = start + BLOCK >= len(data)
-        return packer.compress(data[start : start + BLOCK]) + packer.flush(zlib.Z_FINISH if ends else zlib.Z_SYNC_FLUSH)
-
-    blocks = in_order(compress, range(0, max(len(data), 1), BLOCK))
-    header = b"\x1f\x8b\x08" + bytes(6) + b"\xff"  # deflate, no name, no time, unknown system
-    return header + b"".join(blocks) + struct.pack("<II", zlib.crc32(data), len(data) % 2**32)
+    """A gzip file, without a name or a time."""
+    # Runs and frequent bytes alone: of differences that are mostly 0, other repetitions cost more than they save.
+    packer = zlib.compressobj(6, zlib.DEFLATED, 31, 9, zlib.Z_RLE)
+    return packer.compress(np.ascontiguousarray(array).tobytes()) + packer.flush()
 
 
 def read_baked(folder: Path) -> BakedScene:

@@ -14,7 +14,7 @@ from statistics import fmean
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from rich.progress import track
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
@@ -105,7 +105,7 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         ValueError: if no texel has the least weight.
     """
     texels = _texels(window, window.peaks(pose.rays() for pose in poses))
-    group, level = _heaviest(texels, least, most)
+    group, level = _merged(texels, least, most)
     focal = fmean(pose.focal[0] for pose in poses)
     inside = (group >= 0).nonzero()[:, 0]
     group, level, total = group[inside], level[inside], int(group.max()) + 1
@@ -139,18 +139,6 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         cameras = between(poses, FRACTIONS[number % len(FRACTIONS)])
         splats = fitted(splats, window, track(cameras, description=f"Fitting splats, round {number + 1} of {rounds}"))
     return splats
-
-
-def _heaviest(texels: _Texels, least: float, most: int) -> tuple[Tensor, Tensor]:
-    """Splat of each texel (-1: none) and its level, as ``_merged``, but for all but the ``most`` of largest weight."""
-    group, level = _merged(texels, texels.peaks >= least)
-    is_seen = group >= 0
-    if not is_seen.any():
-        raise ValueError(f"No texel has a rendering weight of {least:g} in a training view: give a smaller --weight.")
-    weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[is_seen], texels.peaks[is_seen], "amax")
-    heaviest = weight.argsort(descending=True)[:most].sort().values
-    numbers = torch.full((len(weight),), -1).index_copy(0, heaviest, torch.arange(len(heaviest)))
-    return torch.where(is_seen, numbers[group.clamp(min=0)], -1), level
 
 
 def between(poses: list[Pose], fraction: float) -> list[Pose]:
@@ -220,8 +208,12 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
     return _Texels(places, -torch.expm1(-depths), depths, channels, highest)
 
 
-def _merged(texels: _Texels, is_seen: Bool[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "T"]]:
-    """Group of each visible texel (-1 for the others), and the number of times that four became one in it."""
+def _merged(texels: _Texels, least: float, most: int) -> tuple[Int[Tensor, "T"], Int[Tensor, "T"]]:
+    """Splat of each texel of at least this weight (-1 for the others, and for all but the ``most`` splats of largest
+    weight), and the number of times that four became one in it."""
+    is_seen = texels.peaks >= least
+    if not is_seen.any():
+        raise ValueError(f"No texel has a rendering weight of {least:g} in a training view: give a smaller --weight.")
     tolerance = texels.channels.new_tensor([AGREEING_ALPHA] + [AGREEING_COLOR] * COLORS)
     tolerance = torch.cat([tolerance, tolerance.new_full((texels.channels.shape[1] - COLORS,), AGREEING_FEATURE)])
     values = torch.cat([texels.alphas[:, None], texels.channels], -1)[is_seen] / tolerance
@@ -240,8 +232,11 @@ def _merged(texels: _Texels, is_seen: Bool[Tensor, "T"]) -> tuple[Int[Tensor, "T
         agrees = (count == 4**depth) & ((high - low).amax(-1) < 1)
         level = torch.where(agrees[parent], depth, level)
     _, group = (cells(level) * (LARGEST + 1) + level).unique(return_inverse=True)
+    weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group, texels.peaks[is_seen], "amax")
+    heaviest = weight.argsort(descending=True)[:most].sort().values
+    numbers = torch.full((len(weight),), -1).index_copy(0, heaviest, torch.arange(len(heaviest)))
     groups, levels = torch.full(is_seen.shape, -1), torch.zeros(is_seen.shape, dtype=torch.int64)
-    groups[is_seen], levels[is_seen] = group, level
+    groups[is_seen], levels[is_seen] = numbers[group], level
     return groups, levels
 
 

@@ -137,12 +137,9 @@ class Pending:
 
     def __init__(self, name: str, number: int, values: Sequence[Any]) -> None:
         self._values = values  # live as long
-        self._finish = functools.partial(_function(f"{name}_finish"), ctypes.c_int64(number))
-        weakref.finalize(self, self._finish)  # before the values go, at the latest at the end of the process
-
-    def finish(self) -> None:
+        self.finish = functools.partial(_function(f"{name}_finish"), ctypes.c_int64(number))
         """Returns when the function has written all of its results."""
-        self._finish()
+        weakref.finalize(self, self.finish)  # before the values go, at the latest at the end of the process
 
 
 def leave_in_parts(name: str, count: int, size: int, *values: Any) -> Pending | None:

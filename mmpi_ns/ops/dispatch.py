@@ -88,7 +88,7 @@ class Operation(Generic[P, R]):
         values = tuple(arguments.values())
         if self.check is not None:
             self.check(*values)
-        form = form_of(self.name, *_tensors(values))
+        form = form_of(self.name, *tensors_in(values))
         if form != "gpu" or _chosen == "native":
             return function(self.name, form)(*values)
         try:
@@ -155,12 +155,12 @@ def operations() -> dict[str, Operation[..., Any]]:
     return _OPERATIONS
 
 
-def _tensors(arguments: Iterable[Any]) -> Iterator[Tensor]:
-    for x in arguments:
+def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
+    for x in values:
         if isinstance(x, Tensor):
             yield x
         elif isinstance(x, tuple):
-            yield from _tensors(x)
+            yield from tensors_in(x)
 
 
 def form_of(name: str, *tensors: Tensor) -> Form:

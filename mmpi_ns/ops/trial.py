@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,18 +76,11 @@ def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:
     leaves += [t.weights for t in taps if t.weights.requires_grad]
     with torch.set_grad_enabled(bool(leaves)):
         results = dispatch.function(name, form)(*copies)
-    numbers = _numbers(results)
+    numbers = [*dispatch.tensors_in(vars(results).values() if is_dataclass(results) else [results])]
     if leaves:
         loss = sum((x * torch.linspace(-1, 1, x.numel(), device=x.device).view(x.shape)).sum() for x in numbers)
         numbers += list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
     return [x.detach() for x in numbers]
-
-
-def _numbers(results: Any) -> list[Tensor]:
-    if isinstance(results, Tensor):
-        return [results]
-    parts = [getattr(results, f.name) for f in fields(results)] if is_dataclass(results) else results
-    return [x for part in parts if isinstance(part, Tensor | tuple) for x in _numbers(part)]
 
 
 # Toy inputs ----------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from mmpi_ns.placement.observations import Array, Observations, farthest_first, find_visible_points
 from mmpi_ns.placement.rule import PlacementConfig, place
@@ -71,16 +72,16 @@ def find_balls(observations: Observations, length: float) -> list[Ball]:
     while low < high:
         count = (low + high) // 2
         fewer = _settled(centers, start[:count])
-        if np.linalg.norm(centers - fewer[_nearest(centers, fewer)], axis=-1).max() <= SLACK * longest / 2:
+        if cdist(centers, fewer).min(-1).max() <= SLACK * longest / 2:
             middles, high = fewer, count
         else:
             low = count + 1
     while len(middles) > 1:  # without windows of too few cameras, smallest first; neighbours take these over
-        counts = np.bincount(_nearest(centers, middles), minlength=len(middles))
+        counts = np.bincount(cdist(centers, middles).argmin(-1), minlength=len(middles))
         if counts.min() >= FEWEST:
             break
         middles = _settled(centers, np.delete(middles, counts.argmin(), axis=0))
-    owner = _nearest(centers, middles)
+    owner = cdist(centers, middles).argmin(-1)
     radii = [float(np.linalg.norm(centers[owner == i] - m, axis=-1).max()) for i, m in enumerate(middles)]
     # Neighbours follow each other: from the window farthest from the middle of all, always to the nearest.
     order, left = [], list(range(len(middles)))
@@ -116,7 +117,7 @@ def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observ
 def _settled(centers: Array, middles: Array) -> Array:
     """Moves every ball to the middle of the cameras nearest to it (Lloyd)."""
     for _ in range(ROUNDS):
-        owner = _nearest(centers, middles)
+        owner = cdist(centers, middles).argmin(-1)
         balls = [centers[owner == i] for i in range(len(middles)) if (owner == i).any()]
         # The centre of the bounding box: balls around it are smaller than around the mean.
         moved = np.stack([(ball.min(0) + ball.max(0)) / 2 for ball in balls])
@@ -124,7 +125,3 @@ def _settled(centers: Array, middles: Array) -> Array:
             break
         middles = moved
     return middles
-
-
-def _nearest(centers: Array, middles: Array) -> NDArray[np.int64]:
-    return np.linalg.norm(middles - centers[:, None], axis=-1).argmin(-1)

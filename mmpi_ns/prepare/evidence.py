@@ -166,24 +166,23 @@ def turns_explain(matched: Sequence[tuple[Array, Array]], fits: Sequence[float])
         return False
 
     def errors(zoom: float) -> Array:
-        return np.array([_turning_error(a / zoom, b / zoom) / (fit / zoom) for (a, b), fit in tried])
+        """Of each pair, the distance within which a rotation takes the share ``TURNING`` of keypoints to their matches,
+        over that up to which one is explained."""
+        within = []
+        for (first, second), fit in tried:
+            a, b = (np.c_[xy / zoom, np.ones(len(xy))] for xy in (first, second))
+            a, b = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (a, b))
+            best, error = np.ones(len(a), bool), np.zeros(len(a))
+            for _ in range(3):  # the rotation of those that fit it best
+                turned = a @ nearest_rotation(b[best].T @ a[best]).T
+                error = np.linalg.norm(turned[:, :2] / turned[:, 2:] - second / zoom, axis=-1)
+                best = error <= np.quantile(error, 0.8)
+            within.append(np.quantile(error, TURNING) / (fit / zoom))
+        return np.array(within)
 
     coarse = min(ZOOMS, key=lambda zoom: float(np.median(errors(zoom))))
     fine = min(coarse * FINE_ZOOMS, key=lambda zoom: float(np.median(errors(zoom))))
     return bool(np.mean(errors(fine) < 1) >= TURNING_PAIRS)
-
-
-def _turning_error(first: Array, second: Array) -> float:
-    """Distance in the plane z = 1 within which a rotation takes the share ``TURNING`` of keypoints to their matches."""
-    a, b = (np.c_[xy, np.ones(len(xy))] for xy in (first, second))
-    a, b = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (a, b))
-    best, error = np.ones(len(a), bool), np.zeros(len(a))
-    for _ in range(3):  # the rotation of those that fit it best
-        u, _, v = np.linalg.svd(b[best].T @ a[best])
-        turned = a @ (u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v).T
-        error = np.linalg.norm(turned[:, :2] / turned[:, 2:] - second, axis=-1)
-        best = error <= np.quantile(error, 0.8)
-    return float(np.quantile(error, TURNING))
 
 
 def share(part: Array, whole: Array) -> float:

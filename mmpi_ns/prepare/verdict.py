@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from mmpi_ns.prepare.evidence import FEW, Array, Witness, agreement, bridges, held_by_side, share, strides
+from mmpi_ns.prepare.evidence import FEW, Witness, agreement, bridges, held_by_side, share, strides
 from mmpi_ns.prepare.images import in_short
 
 Grade = Literal["right", "doubtful", "broken"]
@@ -114,18 +114,13 @@ def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
         others, fitting = ("later" if side else "earlier"), float(held[side, at])
         says = f"{witness.images[at]} is misplaced: {fitting:.0%} of its matches with {others} images fit its pose."
         problems.append((worse(fitting, HELD_BY_SIDE), says))
-    return problems + _leaps(witness, across, between)
-
-
-def _leaps(witness: Witness, across: Array, between: Sequence[str]) -> list[tuple[Grade, str]]:
-    """The largest change of scale, and jumps and changes of speed where few matches hold across a gap."""
-    problems: list[tuple[Grade, str]] = []
+    # The largest change of scale, and jumps and changes of speed where few matches hold across a gap.
     if np.isfinite(witness.scales).any():
         at = int(np.nanargmax(np.abs(witness.scales)))
         change = float(abs(witness.scales[at]))
-        grade: Grade = "right" if change < SCALE[0] else "doubtful" if change < SCALE[1] else "broken"
+        grade = "right" if change < SCALE[0] else "doubtful" if change < SCALE[1] else "broken"
         problems.append((grade, f"The scale changes by {np.expm1(change):.0%} {between[at]}."))
-    is_weak = across < WEAK * float(np.nanmedian(across))
+    is_weak = across < WEAK * usual
     jumps, changes = strides(witness)
     leaps = np.where(is_weak, jumps, 0.0)
     if leaps.max(initial=0.0) > JUMP:

@@ -22,7 +22,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import train_loop
 from nerfstudio.utils import profiler
 
-from mmpi_ns.training.shared_windows import PATIENCE
+from mmpi_ns.training.run import PATIENCE
 from mmpi_ns.utils.errors import quoted
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
-from mmpi_ns.capture.checks import LOAD_RUNS
 from mmpi_ns.placement.defaults import DEFAULTS, NOT_NEGATIVE, POSITIVE, check_placement
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
@@ -109,26 +108,11 @@ def check_nothing_left(model: Any) -> None:
             )
 
 
-def folder_beside_config(config: TrainerConfig, folder: Path) -> Path:
-    """The folder of a run's checkpoints: beside the config.yml that the command was given where the one that it names
-    is gone, as the run was moved. Its windows are looked for there too."""
-    for config_file in values_of("--load-config") if command() in LOAD_RUNS and not folder.is_dir() else ():
-        moved = Path(config_file).absolute().parent / config.relative_model_dir
-        if moved.is_dir():
-            model: Any = config.pipeline.model
-            model.windows_folder = moved.parent / model.windows_folder.name
-            return moved
-    return folder
-
-
 def check_command() -> None:
     """Raises InputError if ns-eval or ns-render would end in an error after it has loaded the run."""
-    {"ns-eval": check_scoring, "ns-render": check_rendering}.get(command() or "", lambda: None)()
-
-
-def check_scoring() -> None:
-    """Raises InputError if ns-eval would end in an error after it has loaded the run."""
-    for output in values_of("--output-path"):
+    if command() == "ns-render":
+        check_rendering()
+    for output in values_of("--output-path") if command() == "ns-eval" else ():
         if Path(output).suffix != ".json":
             raise InputError(f"--output-path {output} is no .json file: give the name of one, eval.json for example.")
         _check_writable(Path(output).parent)
@@ -170,12 +154,9 @@ def check_rendering() -> None:
                 "--output-format images."
             )
         _check_writable(Path(output) if writes_images else Path(output).parent)
-    if "camera-path" in arguments():
-        check_camera_path(Path(next(iter(values_of("--camera-path-filename")), "camera_path.json")))
-
-
-def check_camera_path(file: Path) -> None:
-    """Raises InputError if ns-render cannot follow the path of a file."""
+    if "camera-path" not in arguments():
+        return
+    file = Path(next(iter(values_of("--camera-path-filename")), "camera_path.json"))
     try:
         path = json.loads(file.read_text(encoding="utf-8"))
         size, cameras = [path["render_width"], path["render_height"], path["seconds"]], path["camera_path"]

@@ -16,6 +16,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 
+from mmpi_ns.capture.checks import LOAD_RUNS
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.capture.new_views import image_and_mask
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
@@ -36,10 +37,9 @@ from mmpi_ns.training.checkpoints import (
 )
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.options import check_command, check_device, check_nothing_left, check_run, folder_beside_config
+from mmpi_ns.training.options import check_command, check_device, check_nothing_left, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
-from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
-from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
+from mmpi_ns.training.run import WINDOWS_FOLDER, TrainingRun, WindowShare, cameras_of, views_of
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import command, enter_command, signals_go_to, values_of
@@ -64,15 +64,20 @@ class MMPITrainerConfig(TrainerConfig):
     def get_checkpoint_dir(self) -> Path:
         """The first code of this package that ns-eval, ns-render and ns-viewer run.
 
-        They take every file in this folder for a checkpoint, so the last one is given explicitly.
+        They take every file in this folder for a checkpoint, so the last one is given explicitly. Where a run was moved
+        and the folder that its config.yml names is gone, checkpoints and windows are looked for beside that file.
         """
         enter_command()
-        check_nothing_left(self.pipeline.model)
+        model, folder = cast(Any, self.pipeline.model), super().get_checkpoint_dir()
+        check_nothing_left(model)
         check_command()
         if command() == "ns-render":
             manager: Any = self.pipeline.datamanager
-            manager.backdrop = BACKGROUNDS[cast(Any, self.pipeline.model).rendering.background]
-        folder = folder_beside_config(self, super().get_checkpoint_dir())
+            manager.backdrop = BACKGROUNDS[model.rendering.background]
+        for config_file in values_of("--load-config") if command() in LOAD_RUNS and not folder.is_dir() else ():
+            moved = Path(config_file).absolute().parent / self.relative_model_dir
+            if moved.is_dir():
+                folder, model.windows_folder = moved, moved.parent / model.windows_folder.name
         steps = checkpoints_in(folder)
         if steps and self.load_dir in (None, folder) and self.load_step is None and self.load_checkpoint is None:
             self.load_step = max(steps)

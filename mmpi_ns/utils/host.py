@@ -14,7 +14,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
 from threading import current_thread, main_thread
@@ -210,19 +210,13 @@ def signals_go_to(handle: Callable[[int], object]) -> Iterator[None]:
     if current_thread() is not main_thread():
         yield
         return
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    with ExitStack() as before:
 
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        def first(number: int, _: object) -> None:
+            before.close()
+            handle(number)
 
-    def first(number: int, _: object) -> None:
-        restore()
-        handle(number)
-
-    for number in SIGNALS:
-        signal.signal(number, first)
-    try:
+        for number in SIGNALS:
+            before.callback(signal.signal, number, signal.getsignal(number) or signal.SIG_DFL)
+            signal.signal(number, first)
         yield
-    finally:
-        restore()

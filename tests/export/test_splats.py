@@ -83,7 +83,7 @@ def test_neighbours_that_agree_become_one(window):
     many = splats.splats_of(replace(window), cameras(window), 0.0, 10**6, rounds=0)
     texels = splats._texels(window, torch.ones(window.mpis.density.shape))
     assert len(texels.places.unique(dim=0)) == len(texels.places) > 1.5 * len(many.means)
-    group, level = splats._merged(texels, torch.ones(len(texels.places), dtype=torch.bool))
+    group, level = splats._merged(texels, 0.0, len(texels.places))
     assert level.max() > 0 and torch.bincount(group).max() == 4 ** int(level.max())
     few = splats.splats_of(window, cameras(window), 0.0, 50, rounds=0)
     assert len(few.means) == 50
