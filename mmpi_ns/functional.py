@@ -22,6 +22,7 @@ from mmpi_ns.export.files import HEADER, read_baked
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
 from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.values import Number, check_number
 
 
@@ -112,6 +113,7 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
     return Scene(names, views, device, image_of)
 
 
+@torch_apart()
 @torch.no_grad()
 def render(
     scene: Scene,

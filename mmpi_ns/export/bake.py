@@ -28,7 +28,7 @@ from mmpi_ns.scene.baked import most_of_copies, neighbours
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.training.options import check_nothing_left
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.parallel import in_order
+from mmpi_ns.utils.parallel import in_order, torch_apart
 
 SLACK = 0.01
 """What a texel's colours and features may be off by (before sigmoid and tanh), times the largest weight with which a
@@ -64,6 +64,7 @@ def load_model(load_config: Path, details: bool = False) -> Any:
     return pipeline
 
 
+@torch_apart()
 def bake_run(pipeline: Any, least: float) -> BakedScene:
     """All windows of a finished run, baked, and the details that its model has.
 

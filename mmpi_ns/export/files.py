@@ -32,7 +32,7 @@ from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import write_atomically
-from mmpi_ns.utils.parallel import in_order
+from mmpi_ns.utils.parallel import in_order, torch_apart
 
 FORMAT, VERSION = "mmpi-baked", 4
 HEADER = "scene.json"
@@ -91,6 +91,7 @@ class BakedScene:
 
         return Details(torch.tensor([view.camera for view in self.views]), read)
 
+    @torch_apart()
     def image(self, bundle: RayBundle) -> dict[str, Tensor]:
         """Outputs of an image's rays [H, W], as of the model: with details, where there are some."""
         device = bundle.origins.device

@@ -25,7 +25,7 @@ from mmpi_ns.ops.splat import BLUR, Gaussians, View, splat_errors, splat_image
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.scene.baked import CELLS, SIDE, brick_numbers
 from mmpi_ns.utils.files import write_atomically
-from mmpi_ns.utils.parallel import in_order
+from mmpi_ns.utils.parallel import in_order, torch_apart
 
 WIDTH = 0.35
 """Standard deviation of a splat, in texels."""
@@ -91,6 +91,7 @@ class _Texels:
     peaks: Float[Tensor, "T"]
 
 
+@torch_apart()
 def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, rounds: int = ROUNDS) -> Splats:
     """A baked window as splats.
 
