@@ -375,7 +375,7 @@ def parser_points(
         xyz = np.stack([np.asarray(points[name], dtype=np.float64) for name in "xyz"], -1)
         named = {p.name for p in points.properties} >= {"red", "green", "blue"}
         rgb = [np.asarray(points[name]) if named else np.full(len(xyz), GRAY) for name in ("red", "green", "blue")]
-    except (PlyParseError, KeyError, ValueError, TypeError, OSError) as error:
+    except (PlyParseError, KeyError, ValueError, TypeError, OSError, MemoryError) as error:
         raise InputError(f"{path} is not a PLY file of points ({error}): write it again.") from error
     if not len(xyz):
         return None
