@@ -69,8 +69,10 @@ class Ended:
 class Running:
     """A command that has been started."""
 
-    def __init__(self, name, options, arguments, memory, environment=None):
+    def __init__(self, name, options, arguments, memory, environment=None, shown_on=None):
         self.folder = Path(tempfile.mkdtemp(prefix="trust", dir=os.environ["XDG_CACHE_HOME"]))  # conftest removes it
+        for stream in ("out", "error") if shown_on is not None else ():
+            (self.folder / stream).symlink_to(shown_on)
         self.began = time.monotonic()
         given = (self.folder, name, options, arguments, memory, environment or {})
         self.process = _context.Process(target=_child, args=given, daemon=True)
@@ -119,10 +121,10 @@ def train(data, output, method="mmpi_small", memory=None, **options):
     return start_train(data, output, method, memory, **options).end()
 
 
-def start_train(data, output, method="mmpi_small", memory=None, environment=None, **options):
+def start_train(data, output, method="mmpi_small", memory=None, environment=None, shown_on=None, **options):
     dotted = {name.replace("__", "."): value for name, value in options.items()}
     given = CALM | {"data": Path(data), "output_dir": Path(output), "method": method} | dotted
-    return Running("ns-train", given, [], memory, environment)
+    return Running("ns-train", given, [], memory, environment, shown_on)
 
 
 def call(function, *arguments, memory=None):

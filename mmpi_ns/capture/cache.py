@@ -101,6 +101,8 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
         CONSOLE.print(f"[yellow]{folder} cannot be written to ({error.strerror}): depths are recomputed at each start.")
         return dict(find())
     with lock:
+        for left in folder.glob(f".{path.name}.*.tmp"):  # by a process that was killed, as this one has the lock
+            left.unlink(missing_ok=True)
         arrays = _read(path)
         if arrays is None:
             result: Any = find()

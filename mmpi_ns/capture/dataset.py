@@ -28,6 +28,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from mmpi_ns.capture.checks import check_places, colmap_models, names_of_copies, say_once
+from mmpi_ns.capture.exif import tags_of
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
@@ -135,7 +136,7 @@ class MMPIDataset(InputDataset):
         if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
             name, size = self.image_filenames[image_idx], f"{columns} x {rows} pixels and its camera {width} x {height}"
             with Image.open(name) as image:
-                shows_rows_as_columns = image.getexif().get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
+                shows_rows_as_columns = tags_of(image).get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
             if shows_rows_as_columns and 0 <= columns - height <= 1 and 0 <= rows - width <= 1:
                 raise InputError(
                     f"Image {name} has {size}: its EXIF alone turns it, so turn its pixels, as mmpi-prepare does."
@@ -374,7 +375,7 @@ def parser_points(
         xyz = np.stack([np.asarray(points[name], dtype=np.float64) for name in "xyz"], -1)
         named = {p.name for p in points.properties} >= {"red", "green", "blue"}
         rgb = [np.asarray(points[name]) if named else np.full(len(xyz), GRAY) for name in ("red", "green", "blue")]
-    except (PlyParseError, KeyError, ValueError, TypeError, OSError) as error:
+    except (PlyParseError, KeyError, ValueError, TypeError, OSError, MemoryError) as error:
         raise InputError(f"{path} is not a PLY file of points ({error}): write it again.") from error
     if not len(xyz):
         return None

@@ -17,6 +17,14 @@ SHOT = (
 """Tags about body and shot. The others (orientation, sizes, thumbnails, maker notes) are wrong in a changed copy."""
 
 
+def tags_of(image: Image.Image) -> Image.Exif:
+    """All tags of an image; none where they are damaged, which Pillow finds out late in a PNG or WebP file."""
+    try:
+        return image.getexif()
+    except (SyntaxError, ValueError):
+        return Image.Exif()
+
+
 def light_of(file: Path) -> float:
     """Light that an image got by its EXIF, in arbitrary units: time * sensitivity / aperture squared.
 
@@ -26,7 +34,7 @@ def light_of(file: Path) -> float:
     """
     try:
         with Image.open(file) as image:
-            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+            tags = tags_of(image).get_ifd(ExifTags.IFD.Exif)
     except OSError:
         return float("nan")
     time, aperture, sensitivity = (positive_number(tags.get(tag)) for tag in SHOT[:3])
@@ -44,7 +52,7 @@ def positive_number(value: Any) -> float | None:
 
 def kept_tags(image: Image.Image) -> Image.Exif:
     """The tags of a photo about its body and its shot, for a turned, converted or downscaled copy."""
-    source, kept = image.getexif(), Image.Exif()
+    source, kept = tags_of(image), Image.Exif()
     kept.update({tag: source[tag] for tag in BODY if tag in source})
     shot = source.get_ifd(ExifTags.IFD.Exif)
     if shot:

@@ -13,6 +13,7 @@ import subprocess
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -74,18 +75,30 @@ def library() -> ctypes.CDLL:
     compiler, or it fails."""
     target, program = library_file(), compiler()
     try:
-        if not target.is_file():
+        if target.is_file():
+            with suppress(OSError):  # cut short, or of a newer glibc: containers may share a home folder
+                return ctypes.CDLL(str(target))
+        try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-                unfinished = Path(scratch) / target.name
-                command = [*program, *FLAGS, "-o", str(unfinished), *map(str, sorted(OPS.glob("*/*.cpp")))]
-                subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
-                os.replace(unfinished, target)
-        built = ctypes.CDLL(str(target))
+            return _compiled(program, target, target.parent)
+        except (OSError, subprocess.CalledProcessError):  # full or not to be written: each process compiles its own
+            return _compiled(program, target, None)
     except subprocess.CalledProcessError as error:
-        raise CannotCompile(f"{program[0]} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
+        words = (error.stderr or "").strip() or f"exit status {error.returncode}"
+        raise CannotCompile(f"{program[0]} failed: {words.splitlines()[0]}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CannotCompile(str(error)) from error
+
+
+def _compiled(program: list[str], target: Path, folder: Path | None) -> ctypes.CDLL:
+    """Compiles the library in a folder of the target's disk and keeps it; where there is none, in a temporary one."""
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        unfinished = Path(scratch) / target.name
+        command = [*program, *FLAGS, "-o", str(unfinished), *map(str, sorted(OPS.glob("*/*.cpp")))]
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
+        built = ctypes.CDLL(str(unfinished))
+        if folder is not None:
+            os.replace(unfinished, target)
     return built
 
 

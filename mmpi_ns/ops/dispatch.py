@@ -23,7 +23,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import build
 from mmpi_ns.ops.layout import SMALL, Shapes, annotated, check_shapes
-from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.errors import InputError, brief, say
 
 Route = Literal["auto", "torch", "native"]
 Form = Literal["reference", "cpu", "gpu"]
@@ -290,5 +290,5 @@ def _announce() -> None:
 
 
 def _say(reason: str, instead: str = "Plain torch instead of the compiled operations") -> str:
-    CONSOLE.print(f"{instead}, several times slower: {reason}.")
+    say(f"{instead}, several times slower: {reason}.")
     return reason

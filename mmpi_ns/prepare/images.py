@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
-from mmpi_ns.capture.exif import kept_tags, positive_number
+from mmpi_ns.capture.exif import kept_tags, positive_number, tags_of
 from mmpi_ns.utils.errors import InputError, progress, say
 from mmpi_ns.utils.files import opened, whole, write_text
 
@@ -69,7 +69,7 @@ def find_images(folder: Path) -> list[Path]:
 
         register_heif_opener()
         readable += HEIF
-    files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
+    files = [p for p in folder.rglob("*") if not p.is_dir() and not p.name.startswith(".")]
     images = [p for p in files if p.suffix.lower() in readable]
     images = [p for p in images if p.parent == folder] or images
     kinds: dict[str, list[str]] = {}
@@ -107,8 +107,9 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
     photos, used = [], set()
     with progress("Reading images", len(files)) as advance:
         for file in files:
-            # COLMAP's list of pairs is split at blanks; masks and downscaled copies go by the stem.
-            stem = re.sub(r"\s+", "_", "-".join(file.relative_to(folder).with_suffix("").parts))
+            # COLMAP takes UTF-8 and splits its list of pairs at blanks; masks and downscaled copies go by the stem.
+            stem = "-".join(file.relative_to(folder).with_suffix("").parts).encode("utf-8", "replace").decode()
+            stem = re.sub(r"[\s?]+", "_", stem)
             while stem.lower() in used:
                 stem += "_"
             used.add(stem.lower())
@@ -117,7 +118,7 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
             copy = target / "images" / name
             with opened(file) as image:
                 image.load()
-            exif = image.getexif()
+            exif = tags_of(image)
             is_turned = exif.get(ExifTags.Base.Orientation, 1) not in (0, 1)
             size = ImageOps.exif_transpose(image).size if is_turned else image.size
             if not copy.exists():
@@ -126,7 +127,7 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
                     if is_read and not is_turned:
                         shutil.copyfile(file, partial)
                     else:  # upright in 8 bits: nerfstudio would show it rotated, or not read it
-                        upright = ImageOps.exif_transpose(image)
+                        upright = ImageOps.exif_transpose(image) if is_turned else image
                         if upright.mode.startswith(("I", "F")):
                             values = np.asarray(upright, dtype=np.float64)
                             is_deep = upright.mode.startswith("I") and values.max() > 255

@@ -10,6 +10,7 @@ import sys
 from mmpi_ns.scripts.command import say_version
 
 INTERRUPTED = "mmpi-prepare: interrupted; the same command continues from here."
+KILLED = "mmpi-prepare: ended by {}, perhaps as memory or the disk is full; the same command continues from here."
 PR_SET_PDEATHSIG = 1
 """Of prctl: the signal that a process gets when its parent ends."""
 
@@ -32,6 +33,8 @@ def end_at_once_on_signals() -> None:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
             code = os.waitstatus_to_exitcode(status)
+            if code < 0:  # the shell says this of its own children alone
+                os.write(2, f"\x1b[?25h\n{KILLED.format(signal.Signals(-code).name)}\n".encode())
             os._exit(code if code >= 0 else 128 - code)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)

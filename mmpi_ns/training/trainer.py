@@ -42,7 +42,7 @@ from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_
 from mmpi_ns.training.run import WINDOWS_FOLDER, TrainingRun, WindowShare, cameras_of, views_of
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
-from mmpi_ns.utils.host import command, enter_command, signals_go_to, values_of
+from mmpi_ns.utils.host import command, discard, enter_command, signals_go_to, values_of
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
 
@@ -393,5 +393,8 @@ class MMPITrainer(Trainer):
 def _end(number: int, sentence: str = "Stopped before the first step: there is nothing to go on from.") -> NoReturn:
     """Ends the process with the exit status of the signal (130 after Ctrl-C) and a sentence."""
     sys.stdout.flush()
-    print(sentence, file=sys.stderr, flush=True)
+    try:
+        print(sentence, file=sys.stderr, flush=True)
+    except BrokenPipeError:
+        discard(2)
     raise SystemExit(128 + number)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import stat
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -53,7 +54,8 @@ OWN_MAPPING = 32 << 20
 """Bytes from which an array, such as a table, goes back to the system at once: glibc's upper limit."""
 MALLOC_DEFAULT = 128 << 10
 """glibc's value of both thresholds at the start."""
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, ``kill``, and a terminal that is closed."""
 
 
 @contextmanager
@@ -98,6 +100,16 @@ def _hide_notices() -> Iterator[None]:
 
 
 @contextmanager
+def _outlive_readers() -> Iterator[None]:
+    """CONSOLE.on_broken_pipe: a pipe that nobody reads any more ends no work, as rich would: Ctrl-C ends ``| tee`` at
+    once, and a training after it has saved."""
+
+    vars(CONSOLE).update(on_broken_pipe=lambda: discard(1))
+    yield
+    vars(CONSOLE).pop("on_broken_pipe", None)
+
+
+@contextmanager
 def keep_freed_memory() -> Iterator[None]:
     """glibc's malloc: a training step takes again what the last one freed. Its defaults give much of it back to the
     system, which then hands out zeroed pages: thousands of page faults a step. glibc adapts its defaults and cannot be
@@ -114,7 +126,7 @@ def keep_freed_memory() -> Iterator[None]:
     mallopt(MMAP_THRESHOLD, MALLOC_DEFAULT)
 
 
-PATCHES = (_show_errors, _hide_notices)
+PATCHES = (_show_errors, _hide_notices, _outlive_readers)
 TRAINING_PATCHES = (keep_freed_memory,)
 """Each makes a change of the host that lasts until it is undone; its docstring says of what, and why."""
 _entered: dict[Callable[[], AbstractContextManager[None]], AbstractContextManager[None]] = {}
@@ -169,6 +181,11 @@ def give_back_freed_memory() -> None:
         return
 
 
+def discard(output: int) -> None:
+    """Whatever is written to stdout (1) or stderr (2) from now on, or waits to be, goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), output)
+
+
 # For a block ---------------------------------------------------------------------------------------------------------
 
 
@@ -203,9 +220,9 @@ def uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def signals_go_to(handle: Callable[[int], object]) -> Iterator[None]:
-    """Within the block the first Ctrl-C or SIGTERM calls ``handle`` with its number; the next one has its usual effect.
+    """Within the block the first of ``SIGNALS`` calls ``handle`` with its number; the next one has its usual effect.
 
-    Has no effect outside the main thread.
+    Has no effect outside the main thread, nor on a closed terminal where nohup has it ignored.
     """
     if current_thread() is not main_thread():
         yield
@@ -214,9 +231,16 @@ def signals_go_to(handle: Callable[[int], object]) -> Iterator[None]:
 
         def first(number: int, _: object) -> None:
             before.close()
+            if number == signal.SIGHUP:
+                signal.signal(number, signal.SIG_IGN)  # the shell sends it again
+                for output in (1, 2):
+                    if stat.S_ISCHR(os.fstat(output).st_mode):  # the terminal, on which every word would be an error
+                        discard(output)
             handle(number)
 
         for number in SIGNALS:
-            before.callback(signal.signal, number, signal.getsignal(number) or signal.SIG_DFL)
-            signal.signal(number, first)
+            usual = signal.getsignal(number)
+            if number != signal.SIGHUP or usual != signal.SIG_IGN:
+                before.callback(signal.signal, number, usual or signal.SIG_DFL)
+                signal.signal(number, first)
         yield

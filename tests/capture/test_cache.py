@@ -96,6 +96,12 @@ def test_a_result_that_is_being_computed_is_not_forgotten(tmp_path, monkeypatch)
         assert {p.name for p in tmp_path.glob("*.*")} == {"held.lock", "held.npz", "own.lock", "own.npz"}
 
 
+def test_what_a_killed_process_left_half_written_is_cleared_away(tmp_path):
+    (tmp_path / ".key.npz.77.tmp").write_bytes(b"half a file")
+    remembered("key", counting([]), tmp_path)
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_a_damaged_file_is_found_anew(tmp_path):
     calls = []
     remembered("key", counting(calls), tmp_path)

@@ -120,6 +120,25 @@ def test_what_was_compiled_is_used_again(monkeypatch, unbuilt):
     assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
 
 
+def test_what_was_compiled_and_cannot_be_loaded_is_compiled_anew(monkeypatch, unbuilt):
+    target = build.library_file()
+    target.parent.mkdir()
+    target.write_bytes(b"cut short")
+    assert dispatch.form_of("march", torch.zeros(1)) == "cpu" and target.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("is_full", [True, False])
+def test_where_nothing_can_be_kept_each_process_compiles_its_own(monkeypatch, unbuilt, is_full):
+    if is_full:
+        compiler = unbuilt / "compiler"
+        compiler.write_text(f'#!/bin/sh\ncase "$*" in *"-o {unbuilt}"*) exit 1; esac\nexec g++ "$@"\n')
+        compiler.chmod(0o755)
+        monkeypatch.setenv("CXX", str(compiler))
+    else:
+        (unbuilt / "mmpi_ns").write_text("a file")
+    assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
+
+
 def test_other_precisions_and_the_users_choice_take_the_plain_path():
     assert dispatch.form_of("march", torch.zeros(1, dtype=torch.float64)) == "reference"
     dispatch.choose("torch")

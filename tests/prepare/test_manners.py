@@ -182,9 +182,12 @@ def test_a_signal_ends_the_command_while_the_interpreters_lock_is_held(tmp_path)
     assert run.returncode == 128 + signal.SIGTERM and "interrupted" in said
 
 
-@pytest.mark.parametrize(("ends", "status"), [("sys.exit(3)", 3), ("os.kill(os.getpid(), 9)", 137)])
-def test_the_exit_status_is_that_of_the_work(ends, status):
+@pytest.mark.parametrize(
+    ("ends", "status", "words"), [("sys.exit(3)", 3, ""), ("os.kill(os.getpid(), 9)", 137, "SIGKILL, perhaps")]
+)
+def test_the_exit_status_is_that_of_the_work(ends, status, words):
     program = (
         f"from mmpi_ns.scripts.prepare import end_at_once_on_signals; import os, sys; end_at_once_on_signals(); {ends}"
     )
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == status
+    ended = subprocess.run([sys.executable, "-c", program], check=False, stderr=subprocess.PIPE, text=True)
+    assert ended.returncode == status and (words in ended.stderr if words else not ended.stderr)

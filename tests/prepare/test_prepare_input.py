@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import corridor
 import cv2
 import numpy as np
@@ -97,6 +99,19 @@ def test_exif_that_says_nothing_gives_no_exposure(tmp_path):
     exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExposureTime: IFDRational(1, 8)}
     assert light_of(save(tmp_path / "time.jpg", exif=exif)) == 12.5
     assert exposure_in_words([tmp_path / "bare.jpg"]) == "not known: no EXIF"
+
+
+def test_names_in_no_utf_8_are_replaced(tmp_path):
+    """COLMAP refuses them."""
+    files = [save(tmp_path / "in" / os.fsdecode(name)) for name in (b"caf\xe9 1.png", b"caf\xe8 1.png")]
+    assert [p.name for p in gather(tmp_path / "in", files, tmp_path / "work")] == ["caf_1.png", "caf_1_.png"]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+def test_damaged_exif_counts_as_none(suffix, tmp_path):
+    file = save(tmp_path / f"in/a{suffix}", exif=b"Exif\0\0no tags at all")
+    (photo,) = gather(file.parent, [file], tmp_path / "work")
+    assert photo.exif_focal is None and photo.width == 40 and np.isnan(light_of(file))
 
 
 def test_undistorted_images_keep_exposure_and_alpha_and_masks_stay_black_and_white(tmp_path):
@@ -317,6 +332,13 @@ def test_truncated_image_is_named(tmp_path):
     save(tmp_path / "in/a.png")
     (tmp_path / "in/b.jpg").write_bytes(save(tmp_path / "whole.jpg", (90, 90)).read_bytes()[:300])
     with pytest.raises(InputError, match=r"b\.jpg cannot be read"):
+        prepare(Settings(tmp_path / "in", tmp_path / "scene"))
+
+
+def test_a_link_to_nowhere_among_the_images_is_named(tmp_path):
+    corridor.write_images(tmp_path / "in", 2)
+    (tmp_path / "in/lost.png").symlink_to(tmp_path / "no.png")
+    with pytest.raises(InputError, match=r"in/lost\.png cannot be read"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
 
 

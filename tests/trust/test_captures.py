@@ -184,6 +184,7 @@ def test_a_capture_that_cannot_be_used_is_refused(data, edit, tmp_path, case):
 CLOUDS = {
     "no PLY": b"solid cube", "empty": b"", "cut short": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n"
     b"property float x\nproperty float y\nproperty float z\nend_header\n123",
+    "of too many": b"ply\nformat ascii 1.0\nelement vertex 1000000000000000\nproperty float x\nend_header\n1\n",
     "without z": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n1 2\n",
 }  # fmt: skip
 

@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import signal
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -63,6 +65,34 @@ def test_a_run_that_is_stopped_saves_and_says_how_to_go_on(whole_scene, tmp_path
     assert checkpoint.name == f"step-{step:09d}.ckpt" and f"step {step + 1} of" in last
 
 
+def pipe(tmp_path):
+    """A pipe's end to read from, and its name."""
+    os.mkfifo(tmp_path / "pipe")
+    return os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK), tmp_path / "pipe"
+
+
+def terminal(_):
+    master, slave = os.openpty()
+    os.set_blocking(master, False)
+    return master, os.ttyname(slave)
+
+
+@pytest.mark.parametrize(("makes", "numbers"), [(pipe, [signal.SIGINT]), (terminal, [signal.SIGHUP] * 2)])
+def test_a_run_is_saved_where_those_who_read_its_output_went_too(whole_scene, tmp_path, makes, numbers):
+    """Ctrl-C ends ``| tee``, too; of a terminal that is closed two signals come."""
+    reader, name = makes(tmp_path)
+    running, said, end = start_train(whole_scene, tmp_path, shown_on=name, **LONG), b"", time.monotonic() + 60
+    while b"batch PSNR" not in said and time.monotonic() < end:
+        time.sleep(0.02)
+        with suppress(BlockingIOError):
+            said += os.read(reader, 10_000)
+    os.close(reader)
+    for number in numbers:
+        running.send(number)
+    assert running.end().status == 128 + numbers[0], said
+    assert len(list((folder_of(tmp_path) / "nerfstudio_models").iterdir())) == 1
+
+
 def test_a_run_that_is_stopped_before_it_trains_says_so(whole_scene, tmp_path):
     running = start_train(whole_scene, tmp_path, **LONG)
     running.wait_for("Reading")
@@ -78,6 +108,14 @@ def test_a_run_that_is_stopped_after_its_last_step_says_how_its_details_are_made
         ready(trainer_config(scene, None, tmp_path, 2)).train()
     said = capsys.readouterr().err
     assert ended.value.code == 130 and "Stopped after the last step, which is in" in said and "step-000000001" in said
+
+
+def test_commands_of_ours_are_interrupted_without_a_traceback(tmp_path):
+    running = start("mmpi-scene", "street", tmp_path / "street")
+    running.wait_for("looking for points")
+    running.send(signal.SIGINT)
+    ended = running.end()
+    assert ended.status == 130 and ended.error.strip() == "mmpi-scene: Interrupted."
 
 
 def test_details_that_a_stopped_run_lacks_are_made_when_it_goes_on(whole_scene, finished, tmp_path):

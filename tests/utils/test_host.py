@@ -39,7 +39,7 @@ LISTED = {
 def state():
     """What PATCHES change, but for malloc, which cannot be asked."""
     handlers = tuple(signal.getsignal(number) for number in host.SIGNALS)
-    console = {name: vars(CONSOLE).get(name) for name in ("print", "log")}
+    console = {name: vars(CONSOLE).get(name) for name in ("print", "log", "on_broken_pipe")}
     return (
         sys.excepthook,
         tuple(warnings.filters),
@@ -110,6 +110,13 @@ def test_a_program_that_trains_with_this_package_keeps_its_own_hooks(scene, plan
     ready(config).train()
     config.get_checkpoint_dir()
     assert state() == before and mallocs == []
+
+
+def test_a_closed_terminal_ends_nothing_under_nohup():
+    called, before = [], signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with host.signals_go_to(called.append):
+        signal.raise_signal(signal.SIGHUP)
+    assert signal.signal(signal.SIGHUP, before) == signal.SIG_IGN and not called
 
 
 def test_nothing_happens_at_import():
