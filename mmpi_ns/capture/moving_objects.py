@@ -200,12 +200,23 @@ def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int,
     y = np.arange(height)[:, None]
     result |= columns_of & (y >= np.minimum(first, body)) & (y <= last) & ~static
     closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    _, labels = cv2.connectedComponents(closed)
-    # With all that the closed parts enclose.
-    outside = ~np.pad(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])), 1)
-    _, labels = cv2.connectedComponents(outside.astype(np.uint8), connectivity=4)
-    whole = (labels != labels[0, 0])[1:-1, 1:-1]
+    whole = filled(touching(closed > 0, part))
     return whole if part.sum() > CORE * (whole.sum() + (whole & judged).sum()) / 2 else np.zeros_like(whole)
+
+
+def touching(mask: Mask, seeds: Mask) -> Mask:
+    """The connected parts of a mask in which seeds lie. [h, w]"""
+    number, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    kept = np.bincount(labels.ravel(), seeds.ravel(), number) > 0
+    kept[0] = False
+    return kept[np.asarray(labels, np.int64)]
+
+
+def filled(mask: Mask) -> Mask:
+    """A mask with all that it encloses. [h, w]"""
+    outside = ~np.pad(mask, 1)
+    _, labels = cv2.connectedComponents(outside.astype(np.uint8), connectivity=4)
+    return (labels != labels[0, 0])[1:-1, 1:-1]
 
 
 def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> Mask:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from mmpi_ns.capture.moving_evidence import ALL, Bytes, Mask, Neighbour, Shot, least_unlike
+from mmpi_ns.capture.moving_objects import filled, touching
 
 EXPLAINED, UNLIKE = 1.0, 8.0
 """Levels beyond the image's noise up to which one neighbour explains a pixel, and from which none does."""
@@ -48,34 +49,16 @@ def outlined(
     leaves = mask & (unlike < noise + EXPLAINED) & ~body
     if shot.level is not None:
         leaves &= rows > shot.level + LEVEL
-    left = touching(_closed(mask & ~leaves) & mask, core)
+    padded = np.pad((mask & ~leaves).astype(np.uint8), CLOSED)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(CLOSED))[CLOSED:-CLOSED, CLOSED:-CLOSED] > 0
+    left = touching(closed & mask, core)
     near = cv2.dilate(left.astype(np.uint8), _disc(2 * AROUND + 1)) > 0
     joins = near & (unlike > noise + UNLIKE) & (unlike < ALL)
     both = cv2.morphologyEx((left | joins).astype(np.uint8), cv2.MORPH_OPEN, _disc(OPENED)) > 0
-    shown = _filled(touching(both | left, left))
+    shown = filled(touching(both | left, left))
     # Pixels along an outline mix what is on both sides of it.
     return shown | ((cv2.dilate(shown.astype(np.uint8), _disc(3)) > 0) & (unlike >= noise + EXPLAINED))
 
 
-def touching(mask: Mask, seeds: Mask) -> Mask:
-    """The connected parts of a mask in which seeds lie. [h, w]"""
-    number, labels = cv2.connectedComponents(mask.astype(np.uint8))
-    kept = np.bincount(labels.ravel(), seeds.ravel(), number) > 0
-    kept[0] = False
-    return kept[np.asarray(labels, np.int64)]
-
-
 def _disc(across: int) -> Bytes:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (across, across)), np.uint8)
-
-
-def _closed(mask: Mask) -> Mask:
-    padded = np.pad(mask.astype(np.uint8), CLOSED)
-    return cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(CLOSED))[CLOSED:-CLOSED, CLOSED:-CLOSED] > 0
-
-
-def _filled(mask: Mask) -> Mask:
-    """A mask with all that it encloses. [h, w]"""
-    outside = ~np.pad(mask, 1)
-    _, labels = cv2.connectedComponents(outside.astype(np.uint8), connectivity=4)
-    return (labels != labels[0, 0])[1:-1, 1:-1]
