@@ -66,7 +66,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 17
+VERSION = 18
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -120,11 +120,13 @@ def find_moving(
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
         looks = {i: look for i, (_, look) in zip(again, second, strict=True)}
-        masks = _outlined(shots, near, _followed_on(shots, near, masks, looks, pool), looks, pool)
-    # Whatever moves comes close at some time; what is found where nothing moves is mostly small. Walkers may stay away.
-    if max((mask.mean() for mask in masks), default=0.0) < LARGE:
-        walkers = {i: seen.walkers for i, seen in first.items() if seen.walkers.any()}
-        masks = [walkers[i] if i in walkers and len(walkers) >= WALKERS else nothing[i] for i in range(len(masks))]
+        masks = _followed_on(shots, near, masks, looks, pool)
+        # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
+        if max((mask.mean() for mask in masks), default=0.0) >= LARGE:
+            masks = _outlined(shots, near, masks, looks, pool)
+        else:  # walkers may stay away
+            walkers = {i: seen.walkers for i, seen in first.items() if seen.walkers.any()}
+            masks = [walkers[i] if i in walkers and len(walkers) >= WALKERS else nothing[i] for i in range(len(masks))]
     return [shot.view for shot in shots], masks, doubt_of(shots, up, masks)
 
 
