@@ -113,7 +113,7 @@ def test_images_of_a_baked_scene_are_those_of_its_bricks(baked):
         assert (images.depth.view(-1) / expected["depth"].view(-1)).log().abs().median() < 1e-4
 
 
-def test_baked_images_leave_the_cores_to_the_kernels(baked, monkeypatch):
+def test_baked_images_leave_the_cores_to_the_kernels(baked, monkeypatch, three_threads):
     """Torch's second thread would spin beside them: of rays made for ``render``, and where an image is asked for."""
     scene, bricks, threads = mmpi_ns.load(baked, device="cpu"), read_baked(baked), []
 
@@ -122,15 +122,11 @@ def test_baked_images_leave_the_cores_to_the_kernels(baked, monkeypatch):
 
     monkeypatch.setattr("mmpi_ns.functional.image_rays", watched(image_rays))
     monkeypatch.setattr(BakedScene, "render", watched(BakedScene.render))
-    torch.set_num_threads(2)
-    try:
-        mmpi_ns.render(scene, scene.path.camera_to_worlds[0], scene.path.intrinsics[0], 20, 12)
-        assert len(threads) > 1 and set(threads) == {1}
-        threads.clear()
-        bricks.image(image_rays(Cameras(scene.path.camera_to_worlds[:1], 20.0, 20.0, 10.0, 6.0, 20, 12)))
-        assert threads and set(threads) == {1} and torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(1)
+    mmpi_ns.render(scene, scene.path.camera_to_worlds[0], scene.path.intrinsics[0], 20, 12)
+    assert len(threads) > 1 and set(threads) == {1}
+    threads.clear()
+    bricks.image(image_rays(Cameras(scene.path.camera_to_worlds[:1], 20.0, 20.0, 10.0, 6.0, 20, 12)))
+    assert threads and set(threads) == {1} and torch.get_num_threads() == 3
 
 
 def test_cameras_come_in_batches_of_any_shape(baked):

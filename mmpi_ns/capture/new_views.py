@@ -93,19 +93,36 @@ class SharedPoints:
         return bundle, torch.lerp(colors[:, 0], colors[:, 1], share), depths / torch.cat([length, length**2], -1)
 
 
-def seen_alike(
-    shown: tuple[ndarray, ...], posed: PosedImages, j: int, points: Float[ndarray, "P 3"], colors: Float[ndarray, "P C"]
-) -> tuple[Int[ndarray, "S"], UInt8[ndarray, "S C"]]:
-    """Numbers and colours of the points that image j shows at their distance, coloured alike. ``shown``: its colours
-    [H, W, C], where it is usable [H, W], and inverse distances with their errors [H, W, 2]; and the darkest and the
-    brightest of the pixels around each [H, W, C]."""
-    at, (image, usable, depth, *bounds) = project(posed, j, points), shown
-    inverse, may, darkest, brightest = (look_up(m, *at.T, nearest=True) for m in (depth[..., 0], usable, *bounds))
-    expected = 1 / np.maximum(np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1), 1e-12)
-    same_depth = (inverse > 0) & (np.abs(inverse - expected) < SAME_DEPTH * expected)
-    low, high = darkest.astype(int) - SAME_COLOR, brightest.astype(int) + SAME_COLOR
-    seen = np.nonzero(same_depth & ((colors >= low) & (colors <= high)).all(-1) & (may > 0))[0]
-    return seen, look_up(image, *at[seen].T)
+@dataclass(frozen=True)
+class ShownImage:
+    """An image prepared for comparison with others."""
+
+    image: UInt8[ndarray, "H W C"]
+    darkest: UInt8[ndarray, "H W C"]
+    """Of the pixels around,"""
+    brightest: UInt8[ndarray, "H W C"]
+    """and the brightest."""
+    usable: UInt8[ndarray, "H W"]
+    depth: Float[ndarray, "H W 2"]
+
+    @staticmethod
+    def of(image: UInt8[ndarray, "H W C"], usable: UInt8[ndarray, "H W"], depth: Float[ndarray, "H W 2"]) -> ShownImage:
+        around = np.ones((3, 3), np.uint8)
+        darkest, brightest = (np.asarray(bound(image, around), np.uint8) for bound in (cv2.erode, cv2.dilate))
+        return ShownImage(image, darkest, brightest, usable, depth)
+
+    def shows(
+        self, posed: PosedImages, j: int, points: Float[ndarray, "P 3"], colors: Float[ndarray, "P C"]
+    ) -> tuple[Int[ndarray, "S"], UInt8[ndarray, "S C"]]:
+        """Numbers and colours of the points that image j, this one, shows at their distance, coloured alike."""
+        at = project(posed, j, points)
+        maps = self.depth[..., 0], self.usable, self.darkest, self.brightest
+        inverse, may, darkest, brightest = (look_up(m, *at.T, nearest=True) for m in maps)
+        expected = 1 / np.maximum(np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1), 1e-12)
+        same_depth = (inverse > 0) & (np.abs(inverse - expected) < SAME_DEPTH * expected)
+        low, high = darkest.astype(int) - SAME_COLOR, brightest.astype(int) + SAME_COLOR
+        seen = np.nonzero(same_depth & ((colors >= low) & (colors <= high)).all(-1) & (may > 0))[0]
+        return seen, look_up(self.image, *at[seen].T)
 
 
 def find_shared_points(
@@ -123,13 +140,11 @@ def find_shared_points(
     ``seed`` chooses among more than ``MOST`` pixels. ``exposures`` are those of all training images, by which colours
     are divided; None: they are equal. Raises InputError naming an image or mask that cannot be used.
     """
-
-    def read(i: int) -> tuple[ndarray, ...]:
-        image, usable = image_and_mask(dataset, i)
-        around = (np.asarray(bound(image, np.ones((3, 3), np.uint8)), np.uint8) for bound in (cv2.erode, cv2.dilate))
-        return image, usable, depths.image(i), *around
-
-    show = held(read, posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1)  # neighbours mostly stand side by side
+    # Neighbours mostly stand side by side.
+    show = held(
+        lambda i: ShownImage.of(*image_and_mask(dataset, i), depths.image(i)),
+        posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1,
+    )  # fmt: skip
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
     parts, matches = [], 0.0
     shared = in_order(lambda i: _matches(i, images, show, posed, rays, budget, seed, exposures), images)
@@ -148,7 +163,7 @@ def find_shared_points(
 def _matches(
     i: int,
     images: Sequence[int],
-    show: Callable[[int], tuple[ndarray, ...]],
+    show: Callable[[int], ShownImage],
     posed: PosedImages,
     rays: Rays,
     most: int,
@@ -159,9 +174,9 @@ def _matches(
 
     Its pixels of certain depth are compared, ``most`` at most; second comes the number of matches that all would have.
     """
-    image, usable, depth, *_ = show(i)
-    inverse, error = depth[..., 0], depth[..., 1]
-    rows, columns = np.nonzero((inverse > 0) & (error < CERTAIN * inverse) & (usable > 0))
+    shown = show(i)
+    inverse, error = shown.depth[..., 0], shown.depth[..., 1]
+    rows, columns = np.nonzero((inverse > 0) & (error < CERTAIN * inverse) & (shown.usable > 0))
     count, parts, matches = len(rows), [], 0.0
     if count > most:
         chosen = np.sort(np.random.default_rng((seed, i)).choice(count, most, replace=False))
@@ -169,14 +184,14 @@ def _matches(
     if not count:
         return parts, matches
     pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
-    depths, colors = depth[rows, columns], image[rows, columns]
+    depths, colors = shown.depth[rows, columns], shown.image[rows, columns]
     directions = rays(pixels).directions.double().cpu().numpy()
     points = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1]
     for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):
         expected = colors.astype(np.float32)
         if exposures is not None:
             expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
-        seen, theirs = seen_alike(show(j), posed, j, points, expected.clip(0, 255))
+        seen, theirs = show(j).shows(posed, j, points, expected.clip(0, 255))
         matches += len(seen) * count / len(rows)
         other, both = torch.full((len(seen),), j, dtype=torch.int32), np.stack([colors[seen], theirs], 1)
         parts.append((pixels[seen].int(), other, torch.from_numpy(both), torch.from_numpy(depths[seen])))

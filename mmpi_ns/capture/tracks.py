@@ -81,6 +81,12 @@ def original_of(file: Path) -> tuple[Path, int]:
     return file, 1
 
 
+def format_of(file: Path) -> str:
+    """The format of an image file, whatever its ending. Raises InputError if it cannot be read (names it)."""
+    with opened(file) as image:
+        return str(image.format)
+
+
 def size_of(file: Path) -> NDArray[np.float64]:
     """Width and height of an image file. Raises InputError if it cannot be read (names it)."""
     with opened(file) as image:
@@ -156,10 +162,7 @@ def triangulate(images: PosedImages) -> SfmModel:
     InputError if an image file cannot be read."""
     pycolmap, tracks, error = load_pycolmap(), None, np.nan
     # By their indices as names, since two folders may contain files of the same name.
-    endings = []
-    for file in images.files:
-        with opened(file) as image:
-            endings.append(FORMATS.get(str(image.format)))
+    endings = [FORMATS.get(format_of(file)) for file in images.files]
     names = [f"{i:06d}{ending or '.png'}" for i, ending in enumerate(endings)]
     pairs = [(names[i], names[j]) for i, j in near_pairs(images.camera_to_worlds, NEIGHBOURS)]
     opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
@@ -181,12 +184,7 @@ def triangulate(images: PosedImages) -> SfmModel:
             work, database = Path(folder) / "images", Path(folder) / "database.db"
             work.mkdir()
             for name, file, ending in zip(names, images.files, endings, strict=True):
-                if ending:
-                    os.symlink(file.resolve(), work / name)
-                else:
-                    with opened(file) as image:
-                        gray = image.convert("L")
-                    gray.save(work / name, compress_level=1)
+                os.symlink(file.resolve(), work / name) if ending else _convert(file, work / name)
             model = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
             sfm.write_images(model, database)
             options.sift.peak_threshold = contrast
@@ -202,6 +200,13 @@ def triangulate(images: PosedImages) -> SfmModel:
             tracks = read_reconstruction(model, MIN_TRACK)
     assert tracks is not None
     return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
+
+
+def _convert(file: Path, target: Path) -> None:
+    """Writes an image of a format that COLMAP does not read as a gray PNG."""
+    with opened(file) as image:
+        gray = image.convert("L")
+    gray.save(target, compress_level=1)
 
 
 def _epipolar_error(database: Path, model: Any) -> float:

@@ -193,15 +193,20 @@ def write_details(
         path = folder / f"{i:05d}.npz"
         write_atomically(path, partial(write_arrays, arrays=arrays))
         size += path.stat().st_size
-        camera, fisheye = cameras[i], kinds[i] == CameraType.FISHEYE.value
-        pose, lens = camera.camera_to_worlds.reshape(3, 4), camera.distortion_params
-        local = bundle.directions.reshape(-1, 3) @ pose[:, :3]
-        radius, ahead = local[:, :2].norm(dim=-1), -local[:, 2]
-        reach = (torch.atan2(radius, ahead) if fisheye else radius / ahead.clamp(min=1e-6)).max()
-        intrinsics = (x.reshape(1) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
-        numbers = [pose.reshape(-1), *intrinsics, torch.zeros(6) if lens is None else lens.reshape(-1)]
-        numbers.append(torch.tensor([float(fisheye), 1.001 * float(reach)]))
-        rows.append(torch.cat([x.float().cpu() for x in numbers]).numpy())
+        rows.append(_camera_row(cameras[i], bundle, kinds[i] == CameraType.FISHEYE.value))
     arrays = {"step": np.array(step), "cameras": np.stack(rows)}
     write_atomically(folder / CAMERAS_FILE, partial(write_arrays, arrays=arrays))
     return f"Details of {len(rows)} training images, {size / 2**20:,.0f} MiB, are in {folder}."
+
+
+def _camera_row(camera: Cameras, bundle: RayBundle, fisheye: bool) -> NDArray[np.float32]:
+    """The numbers of a camera that ``seen_details`` takes. [24]"""
+    pose = camera.camera_to_worlds.reshape(3, 4)
+    local = bundle.directions.reshape(-1, 3) @ pose[:, :3]
+    radius, ahead = local[:, :2].norm(dim=-1), -local[:, 2]
+    reach = (torch.atan2(radius, ahead) if fisheye else radius / ahead.clamp(min=1e-6)).max()
+    lens = camera.distortion_params
+    lens = torch.zeros(6) if lens is None else lens.reshape(-1)
+    intrinsics = (x.reshape(1) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+    numbers = [pose.reshape(-1), *intrinsics, lens, torch.tensor([float(fisheye), 1.001 * float(reach)])]
+    return torch.cat([x.float().cpu() for x in numbers]).numpy()

@@ -6,8 +6,6 @@ import json
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,7 +15,7 @@ from training_runs import datamanager
 from mmpi_ns.capture import moving
 from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving import WALKERS, find_moving, gain_of, in_image
+from mmpi_ns.capture.moving import gain_of, in_image
 from mmpi_ns.capture.moving_carry import Carried
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import (
@@ -62,33 +60,6 @@ def test_most_of_the_cars_is_masked_and_little_else(drive, manager):
         static.append(mask[truth == 0])
     assert np.concatenate(moving).mean() > 0.75
     assert np.concatenate(static).mean() < 0.02
-
-
-@pytest.mark.parametrize(("large", "walkers"), [(False, 0), (True, 0), (False, WALKERS - 1), (False, WALKERS)])
-def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_in_several(monkeypatch, large, walkers):
-    view = View(np.zeros((20, 50), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((20, 50), bool))
-    nothing = Depth(*np.zeros((2, 20, 50), np.float32))
-    shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), nothing, None) for _ in range(5)]
-
-    def moves(shots, near, i, masks, uprights, first):
-        mask = np.zeros((20, 50), bool)
-        mask.flat[: (16 if large else 14) if i == 1 else 3] = True
-        person = np.zeros((20, 50), bool)
-        person[0, :2] = i < walkers
-        return mask, SimpleNamespace(walkers=person)
-
-    monkeypatch.setattr(moving, "find_depths", lambda *_: iter(shots))
-    monkeypatch.setattr(moving, "_moves", moves)
-    margin = np.arange(1000).reshape(20, 50) >= 990  # of outlines, which does not count
-    monkeypatch.setattr(moving, "_followed_on", lambda shots, near, masks, *_: masks)
-    monkeypatch.setattr(moving, "_outlined", lambda shots, near, masks, *_: [mask | margin for mask in masks])
-    monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
-    poses = np.tile(np.eye(4)[:3], (5, 1, 1))
-    poses[:, 0, 3] = range(5)
-    images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile([50.0, 20], (5, 1)), np.zeros((5, 4)))
-    _, masks, _ = find_moving(images, lambda i: np.zeros((0, 3)))
-    people = [2 * (i < walkers == WALKERS) for i in range(5)]
-    assert [int(mask.sum()) for mask in masks] == ([13, 26, 13, 13, 13] if large else people)
 
 
 def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed_or_a_person(monkeypatch):

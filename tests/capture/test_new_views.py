@@ -218,6 +218,5 @@ def test_an_image_of_more_points_than_sixteen_bits_count():
     depth[..., 0] = 0.4 / np.sqrt(((columns - WIDTH / 2) / FOCAL) ** 2 + ((HEIGHT / 2 - rows) / FOCAL) ** 2 + 1)
     own = image[y.astype(int), x.astype(int)]
     usable = np.ones((HEIGHT, WIDTH), np.uint8)
-    shown = image, usable, depth, np.zeros_like(image), np.full_like(image, 255)
-    seen, colors = new_views.seen_alike(shown, posed(), 1, points, own)
+    seen, colors = new_views.ShownImage.of(image, usable, depth).shows(posed(), 1, points, own)
     assert np.array_equal(seen, np.arange(count)) and colors.shape == (count, 3)

@@ -205,16 +205,12 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
     assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
 
 
-def test_torch_takes_one_thread_while_a_run_is_baked(trainer, monkeypatch):
+def test_torch_takes_one_thread_while_a_run_is_baked(trainer, monkeypatch, three_threads):
     filled(trainer)
     threads, rays = [], bake_module.image_rays
     monkeypatch.setattr(bake_module, "image_rays", lambda *v: threads.append(torch.get_num_threads()) or rays(*v))
-    torch.set_num_threads(2)
-    try:
-        bake_run(trainer.pipeline, 0)
-        assert threads and set(threads) == {1} and torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(1)
+    bake_run(trainer.pipeline, 0)
+    assert threads and set(threads) == {1} and torch.get_num_threads() == 3
 
 
 def test_cameras_that_train_and_are_scored_are_training_cameras(trainer, monkeypatch):

@@ -89,15 +89,11 @@ def test_neighbours_that_agree_become_one(window):
     assert len(few.means) == 50
 
 
-def test_torch_takes_one_thread_while_splats_are_made(window, monkeypatch):
+def test_torch_takes_one_thread_while_splats_are_made(window, monkeypatch, three_threads):
     threads, texels = [], splats._texels
     monkeypatch.setattr(splats, "_texels", lambda *v: threads.append(torch.get_num_threads()) or texels(*v))
-    torch.set_num_threads(2)
-    try:
-        splats.splats_of(window, cameras(window), 0.0, 50, rounds=0)
-        assert threads == [1] and torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(1)
+    splats.splats_of(window, cameras(window), 0.0, 50, rounds=0)
+    assert threads == [1] and torch.get_num_threads() == 3
 
 
 def test_a_weight_that_no_texel_has_is_refused(window):

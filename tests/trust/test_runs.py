@@ -110,14 +110,6 @@ def test_a_run_that_is_stopped_after_its_last_step_says_how_its_details_are_made
     assert ended.value.code == 130 and "Stopped after the last step, which is in" in said and "step-000000001" in said
 
 
-def test_commands_of_ours_are_interrupted_without_a_traceback(tmp_path):
-    running = start("mmpi-scene", "street", tmp_path / "street")
-    running.wait_for("looking for points")
-    running.send(signal.SIGINT)
-    ended = running.end()
-    assert ended.status == 130 and ended.error.strip() == "mmpi-scene: Interrupted."
-
-
 def test_details_that_a_stopped_run_lacks_are_made_when_it_goes_on(whole_scene, finished, tmp_path):
     shutil.rmtree(finished / "details")
     again = {"load_dir": finished / "nerfstudio_models", "max_num_iterations": 6}

@@ -7,7 +7,7 @@ must weigh to be kept), so a ray costs what lies in front of its first surfaces.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,6 +32,17 @@ OPAQUE_DEPTH = 9.2
 """exp(-9.2) = 1e-4 of the light: far below the weight of a kept sample."""
 
 
+class LiveSamples(NamedTuple):
+    """A flat list of live samples: head by head, ray by ray, near to far."""
+
+    rays: Int[Tensor, "N"]
+    heads: Int[Tensor, "N"]
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    inverse_t: Float[Tensor, "N"]
+    tau: Float[Tensor, "N"]
+
+
 @operation("gpu")
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """The samples of each ray that matter.
@@ -44,12 +55,13 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     """
     hits = plane_hits(*rays[:4], layout.frames)
     first, counts, explained = crossings(layout, rays, hits)
-    numbers, *places, inverse_t, each = _live_samples(layout, tables, rays, hits, first, counts)
-    per_ray, tau = counts.sum(-1), each
-    order, valid = merge(numbers, inverse_t, per_ray)
+    flat = _live_samples(layout, tables, rays, hits, first, counts)
+    per_ray = counts.sum(-1)
+    order, valid = merge(flat.rays, flat.inverse_t, per_ray)
+    tau = flat.tau
     if options.blends and tau.numel():
         local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
-        tau = each.clone()
+        tau = flat.tau.clone()
         # Front to back until a ray lets less than exp(-OPAQUE_DEPTH) through. Reliability costs a lookup in every head,
         # and most samples lie behind the first surface: those keep their own depth, which changes weights by less than
         # that. Samples too thin to matter get an equal share without one.
@@ -60,17 +72,17 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
             index = block[visible]
             if not index.numel():
                 break
-            depth = each[index]
+            depth = flat.tau[index]
             thick = (depth > NEGLIGIBLE).nonzero()[:, 0]
             sample = index[thick]
-            samples = (numbers[sample], local, inverse_t[sample], places[0][sample])
-            shares = log_shares(layout, tables.reliability, tables.touched, *samples)
+            places = (flat.rays[sample], local, flat.inverse_t[sample], flat.heads[sample])
+            shares = log_shares(layout, tables.reliability, tables.touched, *places)
             blended = blended_optical_depth(depth[thick], *shares)
             tau[index] = (depth / layout.num_heads).index_copy(0, thick, blended)
             passed += torch.where(visible, tau[block], 0.0).sum(-1)
     order, valid, *skipped = prune(order, valid, tau, options.threshold, options.fair_share)
     order = torch.where(valid, order, len(tau))  # empty slots take the zeros behind the samples
-    columns = (*places, inverse_t, tau)
+    columns = (flat.heads, flat.planes, flat.ndc, flat.inverse_t, tau)
     heads, planes, ndc, inverse_t, tau = (torch.cat([x, x.new_zeros(1, *x.shape[1:])])[order] for x in columns)
     before, total, mass = skipped
     return MergedSamples(heads, planes, ndc, inverse_t, tau, before, valid, total, mass, per_ray, explained)
@@ -154,9 +166,8 @@ def _live_samples(
     hits: PlaneHits,
     first: Int[Tensor, "R H"],
     counts: Int[Tensor, "R H"],
-) -> list[Tensor]:
-    """All live planes of every MPI, and the samples inside the cube, at fixed distances from each camera: of each its
-    ray, head and plane [N], NDC [N, 3], 1/t and optical depth; head by head, ray by ray, near to far."""
+) -> LiveSamples:
+    """All live planes of every MPI, and the samples inside the cube, at fixed distances from each camera."""
     parts, frames = [], layout.frames
     for k, grid in enumerate(layout.grids):
         # (ray, 0..count-1) for every sample, ray by ray.
@@ -184,7 +195,7 @@ def _live_samples(
             texels = grid.trilinear(ndc)
         tau = layout.optical_depth(k, interpolate(tables.density, *texels)[:, 0], planes)
         parts.append((numbers, torch.full_like(numbers, k), planes, ndc, inverse_t, tau))
-    return [torch.cat(columns) for columns in zip(*parts, strict=True)]
+    return LiveSamples(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
 # Merge ---------------------------------------------------------------------------------------------------------------

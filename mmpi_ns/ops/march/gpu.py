@@ -9,9 +9,12 @@ where less than 1e-5 of its light is left, and less than a sample must weigh to 
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import triton
 import triton.language as tl
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import ends
@@ -197,63 +200,74 @@ def show_kernel(
     tl.store(medians + ray, median, inside)
 
 
-def march_into_slots(
-    layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
-) -> tuple[Tensor, list[Tensor], Tensor, list[Tensor]]:
-    """``march`` up to where its result is packed, or summed; nothing is waited for.
+class Slots(NamedTuple):
+    """What rays kept, each in ``room`` slots of its own, before anything is waited for."""
 
-    Returns:
-        How many samples each ray kept [R]. The samples (``empty_samples``), each ray's in ``room`` slots of its own
-        [R, room]; what the other slots hold means nothing. The most that a ray kept, then what was kept of each head
-        [1 + H]. The last fields of ``MergedSamples`` but for the counts of heads.
-    """
+    kept: Int[Tensor, "R"]
+    """Number of them; what the other slots hold means nothing."""
+    samples: list[Tensor]
+    """See ``empty_samples``; [R, room] each."""
+    skipped_total: Float[Tensor, "R 1"]
+    dropped_mass: Float[Tensor, "R 1"]
+    live: Int[Tensor, "R"]
+    explained: Bool[Tensor, "R 1"]
+    numbers: Int[Tensor, "1+H"]
+    """The most that a ray kept, then what was kept of each head."""
+
+
+def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
+    """``march`` up to where its result is packed, or summed."""
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
     threshold, room = float(options.threshold), options.most_kept(layout.most_samples)
     # Where all heads may answer, what stands for the choice is not read.
     parts = [rays.origins if x is None else x for x in dense_fields(rays)]
-    kept = torch.empty(num_rays, dtype=torch.int32, device=device)
-    samples = empty_samples(num_rays, room, index=torch.int32, device=device)
-    skipped_total, dropped_mass = (torch.empty(num_rays, 1, device=device) for _ in range(2))
-    live = torch.empty(num_rays, dtype=torch.int64, device=device)
-    explained = torch.empty(num_rays, 1, dtype=torch.bool, device=device)
-    numbers = torch.zeros(1 + num_heads, dtype=torch.int32, device=device)
+    m = Slots(
+        kept=torch.empty(num_rays, dtype=torch.int32, device=device),
+        samples=empty_samples(num_rays, room, index=torch.int32, device=device),
+        skipped_total=torch.empty(num_rays, 1, device=device),
+        dropped_mass=torch.empty(num_rays, 1, device=device),
+        live=torch.empty(num_rays, dtype=torch.int64, device=device),
+        explained=torch.empty(num_rays, 1, dtype=torch.bool, device=device),
+        numbers=torch.zeros(1 + num_heads, dtype=torch.int32, device=device),
+    )
     heads, (head_rows, biases, cube_row) = triton.next_power_of_2(num_heads), layout.constants
     at_once = block_size(max(1, min(RAYS, RANGES // heads)), device)
     launch(
         march_kernel, num_rays, at_once, *parts,
         head_rows, grids_of(layout), biases, cube_row, *dense_fields(tables),
-        live, explained, kept, skipped_total, dropped_mass, *samples, numbers,
+        m.live, m.explained, m.kept, m.skipped_total, m.dropped_mass, *m.samples, m.numbers,
         num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
         K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,
         ALLOWS=rays.heads is not None, CHOOSES=rays.priorities is not None, BLENDS=options.blends,
         KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS, num_warps=1,
     )  # fmt: skip
-    return kept, samples, numbers, [skipped_total, dropped_mass, live, explained]
+    return m
 
 
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """Waits for the device once, to size the result."""
-    kept, samples, numbers, left = march_into_slots(layout, tables, rays, options)
-    widest, *of_heads = numbers.tolist()
+    m = march_into_slots(layout, tables, rays, options)
+    widest, *of_heads = m.numbers.tolist()
     width = max(1, widest)
-    valid = torch.arange(width, device=kept.device) < kept[:, None]
-    packed = (torch.where(valid.view(valid.shape + (1,) * (x.ndim - 2)), x[:, :width], 0) for x in samples)
+    valid = torch.arange(width, device=m.kept.device) < m.kept[:, None]
+    packed = (torch.where(valid.view(valid.shape + (1,) * (x.ndim - 2)), x[:, :width], 0) for x in m.samples)
     heads, planes, *others = packed
-    return MergedSamples(heads.long(), planes.long(), *others, valid, *left, tuple(of_heads))
+    left = (m.skipped_total, m.dropped_mass, m.live, m.explained, tuple(of_heads))
+    return MergedSamples(heads.long(), planes.long(), *others, valid, *left)
 
 
 def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
     """Nothing is packed, and the host need not know how much any ray kept."""
-    kept, samples, _, (skipped, dropped, *_) = march_into_slots(layout, tables, rays, options)
+    m = march_into_slots(layout, tables, rays, options)
     num_rays, channels, device = len(rays.origins), features.shape[1], features.device
     gathered = torch.empty(num_rays, channels, device=device)
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
     columns, block, warps = sizes(channels, device, NUMBERS)
     launch(
-        show_kernel, num_rays, block, kept, *samples, skipped, *dense(features),
+        show_kernel, num_rays, block, m.kept, *m.samples, m.skipped_total, *dense(features),
         grids_of(layout), gathered, mass, depth, median, winner,
-        num_rays, samples[0].shape[1], channels, len(layout.mpis),
+        num_rays, m.samples[0].shape[1], channels, len(layout.mpis),
         HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
         num_warps=warps,
     )  # fmt: skip
-    return Shown(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, dropped)
+    return Shown(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, m.dropped_mass)
