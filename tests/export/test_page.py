@@ -16,7 +16,6 @@ from browser import CHROMIUM, browser, served
 from random_bricks import random_window, scene_of
 
 import mmpi_ns
-from mmpi_ns.export import files
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
 from mmpi_ns.export.web import write_page
 from mmpi_ns.ops.baked.reader import camera_rays
@@ -44,9 +43,7 @@ def smooth_window(seed, **settings):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(files, "BLOCK", 1000)  # a browser unpacks streams of many blocks
-        write_baked(scene_of(smooth_window(1, num_mpis=3, planes=40), smooth_window(2), radius=1.9), folder)
+    write_baked(scene_of(smooth_window(1, num_mpis=3, planes=40), smooth_window(2), radius=1.9), folder)
     write_page(folder)
     return folder
 
