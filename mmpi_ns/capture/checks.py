@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -32,6 +33,8 @@ FAR_OFF, FEW = 1000.0, 0.1
 """A camera this many times as far away as all but a few others, this fraction of them, is a mistake."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 PATHS = ("file_path", "mask_path", "depth_file_path")
+NO_PATH = "[\0\ud800-\udc7f\udd00-\udfff]"
+"""No path holds these: NUL, and halves of characters other than those that stand for bytes that are no UTF-8."""
 PARSER_OPTIONS = {
     "scale_factor": Number(0, 1e9, above=True),
     "scene_scale": Number(0, above=True),
@@ -94,7 +97,8 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     names = [str(frame["file_path"]) for frame in frames]
     check_places(poses[:, :3, 3], names, path, "nerfstudio-data", auto_scale=parser.auto_scale_poses)
     files = [str(frame[key]) for frame in frames for key in PATHS if key in frame]
-    outside = [n for n in files if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
+    folder = os.path.realpath(path.parent)
+    outside = [n for n in files if not Path(os.path.realpath(path.parent / n)).is_relative_to(folder)]
     if outside:
         say_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
 
@@ -157,7 +161,7 @@ def _check_files(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], fr
                 raise InputError(f"Frame {name} of {path} has no {key}: add it or remove the frame.")
         for key in PATHS:
             value = frame.get(key, "given")
-            if not isinstance(value, str) or not value.strip() or "\0" in value:
+            if not isinstance(value, str) or not value.strip() or re.search(NO_PATH, value):
                 raise InputError(
                     f"The {key} of frame number {i + 1} of {path} is {shown(value)}: give the path of a file as text."
                 )

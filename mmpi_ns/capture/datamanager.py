@@ -36,7 +36,6 @@ from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
-from mmpi_ns.utils.files import opened
 from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import generator
 from mmpi_ns.utils.values import check_options
@@ -124,18 +123,15 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
             mode = kwargs.get("test_mode", "val")
-            splits = ("train", "val" if mode == "val" else "test")
+            splits = ("train", "val", "test") if mode == "val" else ("train", "test")  # for the evaluation after it too
             check_transforms(parser, Path(config.data or parser.data), splits, opens=mode != "inference")
         take_local_origins(parser)
         super().__init__(config, **kwargs)
         self.train_dataset.backdrop = self.eval_dataset.backdrop = config.backdrop
 
     def create_train_dataset(self) -> MMPIDataset:
-        # First, so that what is wrong with the test images is said before minutes of matching.
+        # First, so that what is wrong with images is said before minutes of matching.
         self._test_images = super().create_eval_dataset()
-        for name in self._test_images.image_filenames if self.test_mode == "val" else ():
-            with opened(name):
-                pass
         self.train_dataset = dataset = super().create_train_dataset()
         if not len(dataset):
             raise InputError("The capture holds no training image: check the split that the data parser made.")
@@ -144,6 +140,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 f"--pipeline.datamanager.camera-res-scale-factor {self.config.camera_res_scale_factor:g} leaves no "
                 "pixel of an image: give a larger one."
             )
+        for images in (self._test_images, dataset) if self.test_mode == "val" else ():
+            images.check_files()
         self._pixels = (dataset.cameras.width * dataset.cameras.height).reshape(-1).cpu().numpy()
         """Of each training image."""
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
@@ -189,7 +187,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         )
 
     def create_eval_dataset(self) -> MMPIDataset:
-        if len(self._test_images):
+        if count := len(self._test_images):
+            names = (self._test_images.image_filenames, self.train_dataset.image_filenames)
+            if shared := len(set(names[0]).intersection(names[1])):
+                say(f"{shared} of {count} test images are training images too: scores say little about new views.")
             return self._test_images
         say("The capture has no test images: scores are of training images, and say nothing about new views.")
         return self.dataset_type(self.train_dataparser_outputs, scale_factor=self.config.camera_res_scale_factor)

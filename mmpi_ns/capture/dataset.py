@@ -130,8 +130,27 @@ class MMPIDataset(InputDataset):
                     f"Mask {file} cannot be used ({brief(error)}): give one channel of the image's size, white where "
                     "used."
                 ) from error
-        height, width = (int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width))
         rows, columns = shape
+        height, width = self._checked_size(image_idx, rows, columns)
+        if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
+            unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
+            depth = read_depth_image(Path(files[image_idx]), unit)
+            depth = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
+            camera = self.cameras[image_idx : image_idx + 1]
+            along_axis = -(image_rays(camera).directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
+            data["distance"] = (torch.from_numpy(depth[:height, :width]) / along_axis.clamp(min=1e-6))[..., None]
+        return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
+
+    def check_files(self) -> None:
+        """Raises InputError for an image that cannot be opened, or is not as large as its camera; reads no pixels."""
+        for i, name in enumerate(self.image_filenames):
+            with opened(name) as image:
+                columns, rows = (int(side * self.scale_factor) for side in image.size)
+            self._checked_size(i, rows, columns)
+
+    def _checked_size(self, image_idx: int, rows: int, columns: int) -> tuple[int, int]:
+        """Height and width of an image's camera; InputError where the image with these rows and columns has another."""
+        height, width = (int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width))
         # Downscaled images may have been rounded up where cameras are rounded down: one pixel is cut off.
         if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
             name, size = self.image_filenames[image_idx], f"{columns} x {rows} pixels and its camera {width} x {height}"
@@ -144,14 +163,7 @@ class MMPIDataset(InputDataset):
             raise InputError(
                 f"Image {name} has {size}: correct the camera's size or give the images that the cameras belong to."
             )
-        if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
-            unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
-            depth = read_depth_image(Path(files[image_idx]), unit)
-            depth = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
-            camera = self.cameras[image_idx : image_idx + 1]
-            along_axis = -(image_rays(camera).directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
-            data["distance"] = (torch.from_numpy(depth[:height, :width]) / along_axis.clamp(min=1e-6))[..., None]
-        return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
+        return height, width
 
     def usable(self, image_idx: int) -> NDArray[np.bool_]:
         """Where an image is not masked. [H, W]"""

@@ -92,6 +92,7 @@ REFUSED = {
     "file is null": (frame(file_path=None), ["file_path", "number 4", "None"]),
     "file is empty": (frame(file_path=" "), ["file_path", "number 4"]),
     "file is a list": (frame(file_path=["a.png"]), ["file_path", "number 4"]),
+    "file has half a character": (frame(file_path="images/\ud800.png"), ["file_path", "number 4", "ud800"]),
     "back slashes": (frame(file_path=r"images\none.png"), [r"images\none.png", "write / instead"]),
     "mask is null": (frame(mask_path=None), ["mask_path", "number 4"]),
     "one depth alone": (frame(depth_file_path="a.png"), ["has no depth_file_path and others have one"]),
@@ -169,6 +170,8 @@ REFUSED = {
     "train list of numbers": (file(train_filenames=[1, 2]), ["train_filenames", "unusable"]),
     "train list is empty": (file(train_filenames=[]), ["train_filenames"]),
     "val list is missing": (file(val_filenames=...), ["no list val_filenames"]),
+    "test list is missing": (file(test_filenames=...), ["no list test_filenames"]),
+    "test list is empty": (file(test_filenames=[]), ["unusable test_filenames"]),
 }
 
 
@@ -285,6 +288,11 @@ def test_images_outside_the_folder_are_allowed_and_said_once(data, edit, tmp_pat
 
     edit(move)
     assert train(data, tmp_path).shown.count("lie outside its folder") == 1
+
+
+def test_test_images_that_are_trained_on_are_told(data, edit, tmp_path):
+    edit(lambda meta: meta["train_filenames"].append(meta["test_filenames"][0]))
+    assert "1 of 2 test images are training images too: scores say little" in train(data, tmp_path).shown
 
 
 # mmpi-plan -----------------------------------------------------------------------------------------------------------
