@@ -33,8 +33,8 @@ FAR_OFF, FEW = 1000.0, 0.1
 """A camera this many times as far away as all but a few others, this fraction of them, is a mistake."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 PATHS = ("file_path", "mask_path", "depth_file_path")
-NO_PATH = "[\0\ud800-\udc7f\udd00-\udfff]"
-"""No path holds these: NUL, and halves of characters other than those that stand for bytes that are no UTF-8."""
+NO_PATH = "[\0\ud800-\udfff]"
+"""Not in a path: NUL, and halves of characters, which also stand for bytes of a file's name that are no UTF-8."""
 PARSER_OPTIONS = {
     "scale_factor": Number(0, 1e9, above=True),
     "scene_scale": Number(0, above=True),
@@ -163,7 +163,8 @@ def _check_files(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], fr
             value = frame.get(key, "given")
             if not isinstance(value, str) or not value.strip() or re.search(NO_PATH, value):
                 raise InputError(
-                    f"The {key} of frame number {i + 1} of {path} is {shown(value)}: give the path of a file as text."
+                    f"The {key} of frame number {i + 1} of {path} is {shown(value)}: give the path of a file as text "
+                    "(UTF-8)."
                 )
             if "\\" in value and not (path.parent / value).is_file():
                 raise InputError(

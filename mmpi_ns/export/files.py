@@ -111,7 +111,7 @@ class BakedScene:
 
 
 def write_baked(scene: BakedScene, folder: Path) -> int:
-    """Writes a scene into a folder, the header last, so that a scene with a header is complete.
+    """Writes a scene into a folder in place of an earlier one, the header last: a scene with a header is complete.
 
     Returns:
         Bytes that were written.
@@ -120,7 +120,8 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
         OSError: the disk is full or cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / HEADER).unlink(missing_ok=True)
+    for old in (folder / HEADER, *folder.glob("window-*.bin"), *folder.glob(".*.tmp")):  # of an earlier export
+        old.unlink(missing_ok=True)
     # Details of training images are kept with the window that they stand nearest to.
     views: list[list[StoredView]] = [[] for _ in scene.windows]
     if scene.views:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -17,6 +18,9 @@ from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
     from mmpi_ns.export.files import BakedScene
+
+UNFINISHED = r"window-\d{5}\.bin|\.(window-\d{5}\.bin|scene\.json)\.\d+\.tmp|index\.html"
+"""Names of files of an export without a header: it was stopped or the disk was full, and the next may replace it."""
 
 
 @dataclass
@@ -49,11 +53,13 @@ class _Run:
                 raise ValueError(f"{output} is there already: name another file, or give --overwrite.")
         elif output.exists() and not output.is_dir():
             raise ValueError(f"{output} is a file: name a folder to write.")
-        elif output.is_dir() and any(output.iterdir()):
-            if not (output / "scene.json").is_file():
-                raise ValueError(f"{output} holds other files: name an empty folder, or one that does not exist.")
+        elif (output / "scene.json").is_file():
             if not self.overwrite:
                 raise ValueError(f"{output} holds an export already: name another folder, or give --overwrite.")
+        elif output.is_dir():
+            names = {path.name for path in output.iterdir()}
+            if names == {"index.html"} or not all(re.fullmatch(UNFINISHED, name) for name in names):
+                raise ValueError(f"{output} holds other files: name an empty folder, or one that does not exist.")
         folder = output.parent if is_file else output
         with write_errors(folder, "--output"):  # now, not after minutes of baking
             folder.mkdir(parents=True, exist_ok=True)

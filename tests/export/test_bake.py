@@ -321,6 +321,7 @@ def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
         (["bake", "--load-config", "nothing/config.yml"], "There is no run at nothing/config.yml"),
         (["bake", "--load-config", "run/config.yml"], "The run has no checkpoint"),
         (["web", "--load-config", "run2/config.yml", "--output", "used"], "used holds other files"),
+        (["web", "--load-config", "run2/config.yml", "--output", "home", "--overwrite"], "home holds other files"),
         (["web", "--load-config", "run2/config.yml", "--output", "export"], "give --overwrite"),
         (["web", "--load-config", "run2/config.yml", "--output", "file"], "file is a file"),
         (
@@ -332,10 +333,10 @@ def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
 )
 def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for folder in ("run", "run2/nerfstudio_models", "used", "export"):
+    for folder in ("run", "run2/nerfstudio_models", "used", "home", "export"):
         Path(folder).mkdir(parents=True)
     files = ("run/config.yml", "run2/config.yml", "used/notes.txt", "export/scene.json", "file", "one.html")
-    for name in (*files, "run2/nerfstudio_models/step-000000001.ckpt"):
+    for name in (*files, "home/index.html", "run2/nerfstudio_models/step-000000001.ckpt"):
         Path(name).write_text("{}")
     monkeypatch.setattr(sys, "argv", ["mmpi-export", *arguments])
     with pytest.raises(SystemExit) as caught:

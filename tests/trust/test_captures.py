@@ -93,6 +93,7 @@ REFUSED = {
     "file is empty": (frame(file_path=" "), ["file_path", "number 4"]),
     "file is a list": (frame(file_path=["a.png"]), ["file_path", "number 4"]),
     "file has half a character": (frame(file_path="images/\ud800.png"), ["file_path", "number 4", "ud800"]),
+    "file is named in Latin-1": (frame(file_path="b\udcfcro.png"), ["file_path", "number 4", "udcfc", "UTF-8"]),
     "back slashes": (frame(file_path=r"images\none.png"), [r"images\none.png", "write / instead"]),
     "mask is null": (frame(mask_path=None), ["mask_path", "number 4"]),
     "one depth alone": (frame(depth_file_path="a.png"), ["has no depth_file_path and others have one"]),
