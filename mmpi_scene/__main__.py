@@ -57,6 +57,7 @@ class SceneCommand:
     def main(self) -> None:
         from rich.progress import track
 
+        from mmpi_ns.utils.files import make_writable
         from mmpi_ns.utils.values import Number, check_options
         from mmpi_scene.catalogue import make_scene
         from mmpi_scene.dataset import check_folder, make_exposure, write_dataset
@@ -71,6 +72,7 @@ class SceneCommand:
         check_options(self, {name: r for name, r in ranges.items() if getattr(self, name) is not None}, "--")
         check_folder(self.folder, self.overwrite)
         scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)
+        make_writable(self.folder, "folder")
         if self.moving:
             scene = with_movers(scene, self.moving)
         cameras, points = scene.cameras, self.points or max(4000, 4 * round(self.length or 0))

@@ -113,13 +113,14 @@ def checked_model(path: Path) -> Iterator[None]:
 
 
 def load_pycolmap() -> ModuleType:
-    """pycolmap, which is slow to import. SIGTERM stays as it was: glog's handler prints a stack trace and may wait for
-    ever. Raises InputError if pycolmap is too old."""
-    handler = signal.getsignal(signal.SIGTERM)
+    """pycolmap, which is slow to import. SIGTERM and SIGABRT, by which COLMAP itself ends on a full disk, stay as they
+    were: glog's handler prints a stack trace and may wait for ever. Raises InputError if pycolmap is too old."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGABRT)}
     import pycolmap
 
-    if handler is not None and current_thread() is main_thread():
-        signal.signal(signal.SIGTERM, handler)
+    for number, handler in before.items():
+        if handler is not None and current_thread() is main_thread():
+            signal.signal(number, handler)
     if int(pycolmap.__version__.split(".")[0]) < OLDEST_PYCOLMAP:
         raise InputError(
             f"pycolmap {pycolmap.__version__} is installed, which lacks rigs and the global mapper: "

@@ -13,7 +13,7 @@ import tyro
 
 from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.errors import looked_at, quoted
-from mmpi_ns.utils.files import write_errors
+from mmpi_ns.utils.files import make_writable
 from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
@@ -60,9 +60,7 @@ class _Run:
             names = {path.name for path in output.iterdir()}
             if names == {"index.html"} or not all(re.fullmatch(UNFINISHED, name) for name in names):
                 raise ValueError(f"{output} holds other files: name an empty folder, or one that does not exist.")
-        folder = output.parent if is_file else output
-        with write_errors(folder, "--output"):  # now, not after minutes of baking
-            folder.mkdir(parents=True, exist_ok=True)
+        make_writable(output.parent if is_file else output, "--output")
 
     def bake(self, details: bool = True) -> BakedScene:
         """Bakes the run's scene, with details or its field alone, and prints the loss of quality."""

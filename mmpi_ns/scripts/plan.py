@@ -48,13 +48,12 @@ class PlanCommand:
         from mmpi_ns.capture.datamanager import load_observations
         from mmpi_ns.placement.split import most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
-        from mmpi_ns.utils.files import write_errors
+        from mmpi_ns.utils.files import make_writable
 
         check_placement(self.placement, "--placement.")
         if not self.scene.exists():
             raise InputError(f"There is no scene at {looked_at(self.scene)}: check the path.")
-        with write_errors(self.output, "--output"):
-            self.output.mkdir(parents=True, exist_ok=True)
+        make_writable(self.output, "--output")
         # Before the images are read, so that an error in it is reported at once.
         windows = None if self.plan_file is None else WindowedPlan.load(self.plan_file)
         plan, table = self.output / "plan.json", self.output / "plan.md"

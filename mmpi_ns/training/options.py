@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -17,7 +16,7 @@ from mmpi_ns.placement.defaults import DEFAULTS, NOT_NEGATIVE, POSITIVE, check_p
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.files import write_errors
+from mmpi_ns.utils.files import make_writable
 from mmpi_ns.utils.host import arguments, command, values_of
 from mmpi_ns.utils.machine import unused_gpu
 from mmpi_ns.utils.values import Number, check_number, check_options, shown
@@ -115,15 +114,7 @@ def check_command() -> None:
     for output in values_of("--output-path") if command() == "ns-eval" else ():
         if Path(output).suffix != ".json":
             raise InputError(f"--output-path {output} is no .json file: give the name of one, eval.json for example.")
-        _check_writable(Path(output).parent)
-
-
-def _check_writable(folder: Path) -> None:
-    """Raises WriteError if what a command makes cannot be written there; the folder is made if it is missing."""
-    with write_errors(folder, "--output-path"):
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        make_writable(Path(output).parent, "--output-path")
 
 
 def check_rendering() -> None:
@@ -153,7 +144,7 @@ def check_rendering() -> None:
                 f"--output-path {output} says no format of a film: give a name that ends in .mp4, or add "
                 "--output-format images."
             )
-        _check_writable(Path(output) if writes_images else Path(output).parent)
+        make_writable(Path(output) if writes_images else Path(output).parent, "--output-path")
     if "camera-path" not in arguments():
         return
     file = Path(next(iter(values_of("--camera-path-filename")), "camera_path.json"))

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from PIL import Image
@@ -80,6 +81,14 @@ def write_errors(folder: Path, option: str) -> Iterator[None]:
         raise
     except OSError as error:
         raise WriteError(f"{folder} cannot be written ({brief(error)}): choose another {option}.") from error
+
+
+def make_writable(folder: Path, option: str) -> None:
+    """Makes the folder of a result before the work on it, and tries to write there; errors as ``write_errors``."""
+    with write_errors(folder, option):
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
 
 
 def cache_folder() -> Path:

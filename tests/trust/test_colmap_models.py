@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import struct
 
 import pytest
-from forked import run, train
+from forked import call, run, train
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from tiny_scene import WIDTH
 from training_runs import datamanager
@@ -129,3 +131,17 @@ def test_a_run_of_the_colmap_parser_can_be_rendered_without_its_images(data):
     settings = {"colmap_path": "colmap/sparse/0", "downscale_factor": 2}
     manager = datamanager(data, test_mode="inference", dataparser=ColmapDataParserConfig(**settings))
     assert int(manager.train_dataset.cameras.width[0]) == WIDTH // 2
+
+
+def end_by(number):
+    from mmpi_ns.capture.sfm import load_pycolmap
+
+    load_pycolmap()
+    os.kill(os.getpid(), number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGABRT])
+def test_what_ends_colmap_leaves_no_stack_trace(number):
+    """glog, which pycolmap loads, prints one: COLMAP itself ends by SIGABRT where the disk is full."""
+    ended = call(end_by, number)
+    assert ended.status == -number and "stack trace" not in ended.error

@@ -150,6 +150,13 @@ def test_other_commands_name_the_option_that_cannot_be_used(tmp_path, command, o
     assert not (tmp_path / "out").exists()
 
 
+def test_mmpi_scene_names_a_folder_that_cannot_be_written_before_it_looks_for_points(tmp_path):
+    (tmp_path / "notes.txt").write_text("a file")
+    ended = run("mmpi-scene", "street", tmp_path / "notes.txt/street")
+    assert "notes.txt/street cannot be written" in ended.sentence and "choose another folder" in ended.sentence
+    assert "looking for points" not in ended.out
+
+
 def test_seeds_of_the_machine_are_those_of_our_draws(whole_scene, tmp_path):
     import torch
 
