@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from mmpi_ns.utils.errors import disk_is_full
+from mmpi_ns.utils.errors import used_up
 from mmpi_ns.utils.host import enter_command
 
 
@@ -32,6 +32,6 @@ def run(name: str, command: Any, **how: Any) -> int:
     try:
         tyro.cli(command, **{"prog": name, **how}).main()
     except (ValueError, OSError) as error:
-        print(f"{name}: {disk_is_full(error) or error}", file=sys.stderr)
+        print(f"{name}: {used_up(error) or error}", file=sys.stderr)
         return 1
     return 0

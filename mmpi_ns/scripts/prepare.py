@@ -52,15 +52,18 @@ def entrypoint() -> None:
     import tyro
 
     from mmpi_ns.prepare.settings import Settings
-    from mmpi_ns.utils.errors import InputError, say
+    from mmpi_ns.utils.errors import InputError, say, used_up
 
     settings = tyro.cli(Settings, description=Settings.__doc__)
     from mmpi_ns.prepare.pipeline import prepare
 
     try:
         verdict = prepare(settings)
-    except InputError as error:
-        say(f"mmpi-prepare: {error}", "bold red")
+    except Exception as error:
+        says = error if isinstance(error, InputError) else used_up(error)
+        if says is None:
+            raise
+        say(f"mmpi-prepare: {says}", "bold red")
         sys.exit(1)
     sys.exit(0 if verdict.grade == "right" else 3)
 

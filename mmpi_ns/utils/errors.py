@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import re
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +15,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, or of a user's share of it."""
+NO_MEMORY = "can't allocate memory|out of memory|Insufficient memory|can't start new thread|bad_alloc"
+"""In errors of torch, CUDA, OpenCV, Python and C++ that ask for too much memory, or too many threads."""
 
 
 class InputError(ValueError):
@@ -23,12 +27,23 @@ class WriteError(InputError, OSError):
     """Failure to write a file or folder; one sentence as well."""
 
 
-def disk_is_full(error: BaseException) -> str | None:
-    """A sentence for an error of writing to a full disk; None for any other error, and where there is a sentence."""
-    if not isinstance(error, OSError) or isinstance(error, InputError) or error.errno not in FULL:
+def used_up(error: BaseException) -> str | None:
+    """A sentence for an error of a full disk or of memory that is used up, of the computer or a GPU; None for any other
+    error, and where there is a sentence."""
+    if isinstance(error, InputError):
         return None
-    what = f"{error.filename} could not be written" if error.filename else "A file could not be written"
-    return f"{what} ({error.strerror}): finished files are untouched, so make room and start again."
+    number = getattr(error, "errno", None)
+    if number in FULL:
+        name = getattr(error, "filename", None)
+        what = f"{name} could not be written" if name else "A file could not be written"
+        return f"{what} ({os.strerror(number)}): finished files are untouched, so make room and start again."
+    if isinstance(error, MemoryError) or number == errno.ENOMEM or re.search(NO_MEMORY, str(error)):
+        what = brief(error) or type(error).__name__
+        return (
+            f"Memory is used up ({what}): finished files are untouched, so end other programs or give less, and "
+            "start again."
+        )
+    return None
 
 
 def brief(error: BaseException) -> str:

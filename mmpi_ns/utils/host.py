@@ -24,7 +24,7 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from mmpi_ns.utils.errors import InputError, disk_is_full
+from mmpi_ns.utils.errors import InputError, used_up
 
 TRACEBACK = "MMPI_TRACEBACK"
 """Set to 1 in the environment it shows the traceback of every error, and nerfstudio's notices."""
@@ -60,17 +60,18 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @contextmanager
 def _show_errors() -> Iterator[None]:
-    """sys.excepthook: an InputError or a full disk ends a command with a sentence alone, and Ctrl-C with a word."""
+    """sys.excepthook: an InputError, a full disk or too little memory ends a command with a sentence alone, and Ctrl-C
+    with a word."""
     before = sys.excepthook
 
     def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        full = disk_is_full(error)  # nerfstudio and torch write files too
-        if os.environ.get(TRACEBACK) == "1" or not (full or issubclass(kind, (InputError, KeyboardInterrupt))):
+        says = used_up(error)  # by nerfstudio and torch too
+        if os.environ.get(TRACEBACK) == "1" or not (says or issubclass(kind, (InputError, KeyboardInterrupt))):
             before(kind, error, traceback)
             return
         with suppress(OSError):  # which may be that full disk
             sys.stdout.flush()
-        said = full or (error if issubclass(kind, InputError) else "Interrupted.")
+        said = says or (error if issubclass(kind, InputError) else "Interrupted.")
         print(f"{Path(sys.argv[0]).stem}: {said}", file=sys.stderr, flush=True)
 
     sys.excepthook = show

@@ -11,6 +11,7 @@ import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from nerfstudio.data.dataparsers import nerfstudio_dataparser
@@ -178,6 +179,29 @@ def test_an_input_error_is_one_sentence_and_others_keep_their_traceback(monkeypa
     sys.excepthook(KeyError, KeyError("x"), None)
     sys.excepthook(OSError, OSError(errno.ENOENT, "No such file or directory"), None)
     assert len(shown) == 2
+
+
+def fail(error):
+    raise error
+
+
+TOO_MUCH = {
+    "torch": lambda: torch.empty(2**58),
+    "NumPy": lambda: np.empty(2**58),
+    "a GPU": lambda: fail(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.")),
+    "threads": lambda: fail(RuntimeError("can't start new thread")),
+}
+
+
+@pytest.mark.parametrize("what", TOO_MUCH)
+def test_memory_that_is_used_up_is_one_sentence(monkeypatch, mallocs, capsys, what):
+    monkeypatch.setattr(sys, "argv", ["ns-train"])
+    host.enter_command()
+    with pytest.raises((MemoryError, RuntimeError)) as raised:
+        TOO_MUCH[what]()
+    sys.excepthook(type(raised.value), raised.value, None)
+    said = capsys.readouterr().err
+    assert said.startswith("ns-train: Memory is used up (") and said.count("\n") == 1 and ". " not in said.strip()
 
 
 def test_scores_of_one_test_image_come_without_a_warning(monkeypatch, mallocs):
