@@ -36,6 +36,7 @@ from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.host import arguments, command, values_of
 from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import generator
 from mmpi_ns.utils.values import check_options
@@ -128,6 +129,12 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         take_local_origins(parser)
         super().__init__(config, **kwargs)
         self.train_dataset.backdrop = self.eval_dataset.backdrop = config.backdrop
+        passed = self.train_dataset if "train" in values_of("--pose-source") else self.eval_dataset
+        if command() == "ns-render" and "interpolate" in arguments() and len(passed) < 2:
+            raise InputError(
+                f"A path from image to image needs two, and its split has {passed.image_filenames[0]} alone: give "
+                "--pose-source train."
+            )
 
     def create_train_dataset(self) -> MMPIDataset:
         # First, so that what is wrong with images is said before minutes of matching.

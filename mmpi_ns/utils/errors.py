@@ -33,10 +33,11 @@ def used_up(error: BaseException) -> str | None:
     if isinstance(error, InputError):
         return None
     number = getattr(error, "errno", None)
-    if number in FULL:
+    if number in FULL or os.strerror(errno.ENOSPC) in str(error):  # as ffmpeg says it
         name = getattr(error, "filename", None)
         what = f"{name} could not be written" if name else "A file could not be written"
-        return f"{what} ({os.strerror(number)}): finished files are untouched, so make room and start again."
+        why = os.strerror(number or errno.ENOSPC)
+        return f"{what} ({why}): finished files are untouched, so make room and start again."
     if isinstance(error, MemoryError) or number == errno.ENOMEM or re.search(NO_MEMORY, str(error)):
         what = brief(error) or type(error).__name__
         return (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 
@@ -30,6 +31,18 @@ def render(trained, tmp_path, what, *options):
     shown = tmp_path / ("shown.mp4" if what == "camera-path" else "shown")
     words = ("--load-config", trained / "config.yml", "--output-path", shown, *options)
     return start("ns-render", what, *words, environment={"PATH": f"{tmp_path}:{os.environ['PATH']}"}).end()
+
+
+def test_ns_render_names_the_only_test_image_which_is_no_path(whole_scene, tmp_path):
+    data = shutil.copytree(whole_scene, tmp_path / "data")
+    meta = json.loads((data / "transforms.json").read_text())
+    meta |= {f"{split}_filenames": meta["test_filenames"][:1] for split in ("val", "test")}
+    (data / "transforms.json").write_text(json.dumps(meta))
+    assert train(data, tmp_path).status == 0
+    run, images = tmp_path / "tiny/mmpi-small/run", ("--output-format", "images", "--interpolation-steps", "2")
+    said = render(run, tmp_path, "interpolate", *images).sentence
+    assert name_of(TEST[0]) in said and "--pose-source train" in said
+    assert render(run, tmp_path, "interpolate", *images, "--pose-source", "train").shown
 
 
 @pytest.mark.parametrize("what", ["dataset", "interpolate"])

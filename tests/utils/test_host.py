@@ -176,6 +176,8 @@ def test_an_input_error_is_one_sentence_and_others_keep_their_traceback(monkeypa
     assert not shown and capsys.readouterr().err.endswith(": Interrupted.\n")
     sys.excepthook(OSError, OSError(errno.ENOSPC, "No space left on device", "/out/config.yml"), None)
     assert not shown and "/out/config.yml could not be written (No space left" in capsys.readouterr().err
+    sys.excepthook(RuntimeError, RuntimeError("Error writing 'fly.mp4': [mp4] No space left on device"), None)
+    assert not shown and "could not be written (No space left" in capsys.readouterr().err
     sys.excepthook(KeyError, KeyError("x"), None)
     sys.excepthook(OSError, OSError(errno.ENOENT, "No such file or directory"), None)
     assert len(shown) == 2
