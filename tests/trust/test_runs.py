@@ -362,12 +362,6 @@ def test_an_export_that_was_interrupted_is_begun_anew(trained, tmp_path):
     assert {path.name: path.read_bytes() for path in (tmp_path / "site").iterdir()} == whole
 
 
-def test_an_export_that_cannot_be_written_speaks_of_no_checkpoint(trained, tmp_path):
-    (tmp_path / "site/window-00000.bin").mkdir(parents=True)
-    said = run("mmpi-export", "bake", "--load-config", trained / "config.yml", "--output", tmp_path / "site").sentence
-    assert "window-00000.bin" in said and "--load-dir" not in said
-
-
 @pytest.mark.parametrize(("format", "name"), [("bake", "out"), ("splats", "out/scene.ply")])
 def test_mmpi_export_names_a_folder_that_cannot_be_written_before_it_bakes(trained, tmp_path, format, name):
     (tmp_path / "notes.txt").write_text("a file")

@@ -1,6 +1,9 @@
-"""Folders that results are written to."""
+"""Folders that results are written to, and files that cannot be written."""
 
 from __future__ import annotations
+
+import errno
+import sys
 
 import pytest
 
@@ -17,3 +20,15 @@ def test_a_folder_that_is_there_and_cannot_be_written_is_named(tmp_path, monkeyp
     monkeypatch.setattr(files, "TemporaryFile", refuse)  # root may write everywhere
     with pytest.raises(WriteError, match=r"new cannot be written \(.*Permission denied\): choose another --output"):
         files.make_writable(tmp_path / "new", "--output")
+
+
+@pytest.mark.parametrize(("command", "told"), [("ns-train", True), ("mmpi-export", False)])
+def test_a_full_disk_speaks_of_checkpoints_where_there_are_some(tmp_path, monkeypatch, command, told):
+    def fill(path):
+        path.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sys, "argv", [f"/bin/{command}"])
+    with pytest.raises(WriteError, match=r"a\.bin could not be written .*No space left") as raised:
+        files.write_atomically(tmp_path / "a.bin", fill)
+    assert ("--load-dir" in str(raised.value)) == told and not list(tmp_path.iterdir())
