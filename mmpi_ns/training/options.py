@@ -92,7 +92,7 @@ NO_EFFECT = {
     "pipeline.model": ("enable_collider", "collider_params", "loss_coefficients", "prompt"),
 }
 """nerfstudio's options that have no effect on this method."""
-TRAINED = {"growing_rays", "tv_every"}
+TRAINED = {"growing_rays", "texel_cost", "tv_every"}
 """Options that this version lacks and that changed the training alone."""
 
 
