@@ -22,7 +22,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
+from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, colmap_models, say_once
 from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
@@ -353,11 +353,11 @@ def load_observations(
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
     if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
-        model = next((p for p in ("colmap/sparse/0", "sparse/0", "sparse") if (data / p).is_dir()), None)
-        if model is None:
+        models = colmap_models(data)
+        if not models:
             raise InputError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
-        config.dataparser = ColmapDataParserConfig(colmap_path=Path(model))
-        config.sfm_path = Path(model)
+        config.sfm_path = Path(models[0])
+        config.dataparser = ColmapDataParserConfig(colmap_path=config.sfm_path)
     parser_config = config.dataparser
     config.data = parser_config.data = data
     parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]
