@@ -263,8 +263,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         cameras, seen = self.train_dataset.cameras, self.observations
         sizes = sorted({(int(w), int(h)) for w, h in zip(cameras.width.view(-1), cameras.height.view(-1), strict=True)})
         shapes = f"{sizes[0][0]} x {sizes[0][1]}" + (f" to {sizes[-1][0]} x {sizes[-1][1]}" if len(sizes) > 1 else "")
-        tests = 0 if self.eval_dataset is None else len(self.eval_dataset)
-        parts = [f"{len(cameras)} training and {tests} test images of {shapes}"]
+        parts = [f"{len(cameras)} training and {len(self.eval_dataset)} test images of {shapes}"]
         if len(seen.points):
             parts.append(f"{len(seen.points):,} points seen {len(seen.seen_by):,} times")
         if self.known_depth is not None:
@@ -285,7 +284,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def setup_eval(self) -> None:
         """nerfstudio's loaders, except the one that holds every evaluation image in memory."""
-        assert self.eval_dataset is not None
         sizes = self.eval_dataset.cameras.width * self.eval_dataset.cameras.height
         # An image that cannot be used is named before training, not after it.
         reads = self.test_mode == "val" and sizes.sum() <= self.config.resident_pixels
@@ -299,7 +297,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         """Pixels of one evaluation image, keyed on (seed, step)."""
         self.eval_count += 1
-        assert self.eval_dataset is not None
         g = generator(self.config.seed, step, "evaluation", "cpu")
         number = int(torch.randint(len(self.eval_dataset), (1,), generator=g))
         data = self.eval_dataset[number]

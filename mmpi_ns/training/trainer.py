@@ -321,9 +321,8 @@ class MMPITrainer(Trainer):
             self._write_details(self._last_step)
             if steps := self._last_step + 1 - self._start_step:
                 say(f"Training finished: {steps:,} steps in {duration(monotonic() - self._began)}.")
-            images = self._manager.eval_dataset
-            if self._says_lines and images is not None:
-                say(quick_test(self.pipeline.model, images))
+            if self._says_lines:
+                say(quick_test(self.pipeline.model, self._manager.eval_dataset))
         say(next_commands(self.base_dir))
 
     def _write_details(self, step: int) -> None:
