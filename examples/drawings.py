@@ -165,7 +165,8 @@ def _looking_ahead(places: np.ndarray, focal: float = 190.0) -> Observations:
     """Cameras at some places that look along x, with z up."""
     pose = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     poses = np.concatenate([np.tile(pose, (len(places), 1, 1)), places[:, :, None]], 2)
-    return Observations.of_cameras(poses, [[focal, focal, 160.0, 48.0]] * len(places), [[320.0, 96.0]] * len(places))
+    pinholes, sizes = (np.tile(row, (len(places), 1)) for row in ([focal, focal, 160.0, 48.0], [320.0, 96.0]))
+    return Observations(poses, pinholes, sizes)
 
 
 def _bump(t: np.ndarray, middle: float, width: float) -> np.ndarray:

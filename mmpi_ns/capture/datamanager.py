@@ -22,7 +22,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
+from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, colmap_models, say_once
 from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
@@ -271,8 +271,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         cameras, seen = self.train_dataset.cameras, self.observations
         sizes = sorted({(int(w), int(h)) for w, h in zip(cameras.width.view(-1), cameras.height.view(-1), strict=True)})
         shapes = f"{sizes[0][0]} x {sizes[0][1]}" + (f" to {sizes[-1][0]} x {sizes[-1][1]}" if len(sizes) > 1 else "")
-        tests = 0 if self.eval_dataset is None else len(self.eval_dataset)
-        parts = [f"{len(cameras)} training and {tests} test images of {shapes}"]
+        parts = [f"{len(cameras)} training and {len(self.eval_dataset)} test images of {shapes}"]
         if len(seen.points):
             parts.append(f"{len(seen.points):,} points seen {len(seen.seen_by):,} times")
         if self.known_depth is not None:
@@ -293,7 +292,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def setup_eval(self) -> None:
         """nerfstudio's loaders, except the one that holds every evaluation image in memory."""
-        assert self.eval_dataset is not None
         sizes = self.eval_dataset.cameras.width * self.eval_dataset.cameras.height
         # An image that cannot be used is named before training, not after it.
         reads = self.test_mode == "val" and sizes.sum() <= self.config.resident_pixels
@@ -307,7 +305,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         """Pixels of one evaluation image, keyed on (seed, step)."""
         self.eval_count += 1
-        assert self.eval_dataset is not None
         g = generator(self.config.seed, step, "evaluation", "cpu")
         number = int(torch.randint(len(self.eval_dataset), (1,), generator=g))
         data = self.eval_dataset[number]
@@ -361,11 +358,11 @@ def load_observations(
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
     if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
-        model = next((p for p in ("colmap/sparse/0", "sparse/0", "sparse") if (data / p).is_dir()), None)
-        if model is None:
+        models = colmap_models(data)
+        if not models:
             raise InputError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
-        config.dataparser = ColmapDataParserConfig(colmap_path=Path(model))
-        config.sfm_path = Path(model)
+        config.sfm_path = Path(models[0])
+        config.dataparser = ColmapDataParserConfig(colmap_path=config.sfm_path)
     parser_config = config.dataparser
     config.data = parser_config.data = data
     parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]

@@ -264,7 +264,7 @@ class LocalNerfstudio(Nerfstudio):
 
     def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
         origin = self._origin.place if self._origin.taken else 0.0
-        return _points_or_none(ply_file_path, transform_matrix, scale_factor, origin)
+        return parser_points(ply_file_path, transform_matrix, scale_factor, origin)
 
 
 class LocalScanNet(ScanNet):
@@ -273,7 +273,7 @@ class LocalScanNet(ScanNet):
     def _load_3D_points(
         self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float, points_color: bool
     ) -> Any:
-        return _points_or_none(ply_file_path, transform_matrix, scale_factor) if ply_file_path.is_file() else None
+        return parser_points(ply_file_path, transform_matrix, scale_factor) if ply_file_path.is_file() else None
 
 
 class LocalColmap(ColmapDataParser):
@@ -362,24 +362,12 @@ def _with_sentences(target: type[DataParser], config: DataParserConfig) -> DataP
     return parser
 
 
-def _points_or_none(*how: Any) -> dict[str, Tensor] | None:
-    """``parser_points``, and None with a warning where there are none."""
-    try:
-        points = parser_points(*how)
-    except InputError as error:
-        say_once(f"[bold yellow]{error} Training goes on without the point cloud.")
-        return None
-    if points is None:
-        say_once(f"[bold yellow]The point cloud {how[0]} holds no point: training goes on without it.")
-    return points
-
-
 def parser_points(
     path: Path, transform_matrix: Tensor, scale_factor: float, origin: NDArray[np.float64] | float = 0.0
 ) -> dict[str, Tensor] | None:
     """The point cloud of a PLY file, moved to the scene's axes [3, 4] and scaled, as nerfstudio's data parser returns
-    it; None if it holds no point. ``origin`` is taken off before points are rounded to float32. Raises InputError if it
-    is no PLY file of points."""
+    it; None, with a warning, if it is no PLY file of points or holds none. ``origin`` is taken off before points are
+    rounded to float32."""
     from plyfile import PlyData, PlyParseError  # slow to import; comes with nerfstudio's viewer
 
     try:
@@ -388,8 +376,11 @@ def parser_points(
         named = {p.name for p in points.properties} >= {"red", "green", "blue"}
         rgb = [np.asarray(points[name]) if named else np.full(len(xyz), GRAY) for name in ("red", "green", "blue")]
     except (PlyParseError, KeyError, ValueError, TypeError, OSError, MemoryError) as error:
-        raise InputError(f"{path} is not a PLY file of points ({error}): write it again.") from error
+        says = f"{path} is not a PLY file of points ({error}): write it again."
+        say_once(f"[bold yellow]{says} Training goes on without the point cloud.")
+        return None
     if not len(xyz):
+        say_once(f"[bold yellow]The point cloud {path} holds no point: training goes on without it.")
         return None
     local, colors = torch.from_numpy(xyz - origin).float(), torch.from_numpy(np.stack(rgb, -1).astype(np.uint8))
     places = (local @ transform_matrix[:, :3].T + transform_matrix[:, 3]) * scale_factor

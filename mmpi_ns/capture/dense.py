@@ -29,7 +29,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from mmpi_ns.capture.patches import search_surfaces
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, Parallax, View, load_view, look_up, pixel_grid
-from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, solve_matches
+from mmpi_ns.ops.matches import Measured, average_matches, compare_depths, follow_motion, solve_matches
 from mmpi_ns.ops.motion import find_motion
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
@@ -108,9 +108,9 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
     return look_up(coarse.astype(np.float32), grid_x / step + 0.5, grid_y / step + 0.5)
 
 
-def measure(view: View, neighbour: View, start: Map, flow: Flow, of_view: tuple[Map, Map]) -> tuple[Map, Map]:
-    """Inverse depths [h, w] of a view's pixels by comparison with another view, and one over their squared errors (0:
-    none), from rough inverse depths and the view's ``mean_and_contrast``; ``flow`` finds small motions."""
+def measure(view: View, neighbour: View, start: Map, flow: Flow, of_view: tuple[Map, Map]) -> Measured:
+    """Inverse depths of a view's pixels by comparison with another view, from rough inverse depths and the view's
+    ``mean_and_contrast``; ``flow`` finds small motions."""
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
     motion = flow(view.gray, look_up(neighbour.gray, x, y))
@@ -120,8 +120,7 @@ def measure(view: View, neighbour: View, start: Map, flow: Flow, of_view: tuple[
     alike = correlation(view.gray, look_up(neighbour.gray, x, y), of_view)
     usable = view.inside & seen & (alike > MIN_CORRELATION) & (of_view[1] > MIN_CONTRAST)
     matches = at.x, at.y, torch.from_numpy(alike), torch.from_numpy(usable)
-    inverse, weight = solve_matches(*matches, *parallax.tensors, NOISE**2, MAX_EPIPOLAR**2)
-    return inverse.numpy(), weight.numpy()
+    return solve_matches(*matches, *parallax.tensors, NOISE**2, MAX_EPIPOLAR**2)
 
 
 def mean_and_contrast(image: NDArray[np.uint8]) -> tuple[Map, Map]:
@@ -143,15 +142,6 @@ def _mean(x: NDArray[Any], side: int = WINDOW, *, squared: bool = False) -> Map:
     """Mean of an image, or of its squares, in a square about each pixel."""
     box_filter = cv2.sqrBoxFilter if squared else cv2.boxFilter
     return np.asarray(box_filter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
-
-
-def fuse(inverse: Sequence[Map], weight: Sequence[Map]) -> Depth:
-    """The mean of the largest consistent subset of n measurements [h, w], and its error (``average_matches``).
-
-    Weights are one over squared errors, 0 without a measurement.
-    """
-    q, certainty = (torch.from_numpy(np.stack(each)) for each in (inverse, weight))
-    return Depth(*(x.numpy() for x in average_matches(q, certainty, MAX_RELATIVE)))
 
 
 def find_depths(
@@ -259,7 +249,8 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
         rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         of_view = mean_and_contrast(small.gray)
         pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]
-        depth = without_fringes(small, fuse(*zip(*pairs, strict=True)))
+        mean = average_matches(*map(torch.stack, zip(*pairs, strict=True)), MAX_RELATIVE)
+        depth = without_fringes(small, Depth(mean.inverse.numpy(), mean.certainty.numpy()))
     assert depth is not None
     if surfaces is None:
         return depth

@@ -184,12 +184,11 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     # The axes of an MPI come from a camera and must be orthonormal to more digits than poses in captures are.
     left, _, right = np.linalg.svd(poses[:, :, :3])
     poses[:, :, :3] = left @ right
-    sizes = np.stack([cameras.width.cpu().numpy().reshape(-1), cameras.height.cpu().numpy().reshape(-1)], -1)
-    observations = Observations.of_cameras(poses, np.stack(flat, -1), sizes)
+    sizes = torch.cat([cameras.width, cameras.height], -1).double().cpu().numpy()
     cloud = outputs.metadata.get("points3D_xyz")
     loose = None if cloud is None else usable_points(cloud.double().numpy(), poses[:, :, 3])
     loose = loose if loose is not None and len(loose) else None
-    observations = replace(observations, lens=lens_directions(cameras), loose=loose)
+    observations = Observations(poses, np.stack(flat, -1), sizes, lens=lens_directions(cameras), loose=loose)
     if sfm is None:
         return observations
     transform = outputs.dataparser_transform.double().numpy()

@@ -81,12 +81,6 @@ def original_of(file: Path) -> tuple[Path, int]:
     return file, 1
 
 
-def format_of(file: Path) -> str:
-    """The format of an image file, whatever its ending. Raises InputError if it cannot be read (names it)."""
-    with opened(file) as image:
-        return str(image.format)
-
-
 def size_of(file: Path) -> NDArray[np.float64]:
     """Width and height of an image file. Raises InputError if it cannot be read (names it)."""
     with opened(file) as image:
@@ -153,6 +147,22 @@ def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[t
     return sorted({(min(i, j), max(i, j)) for i, others in enumerate(near) for j in others})
 
 
+def _gathered(files: tuple[Path, ...], folder: Path) -> list[str]:
+    """Names in a folder of images by their indices, since two of other folders may be called the same: linked, or
+    gray PNGs of formats that COLMAP does not read. Raises InputError if an image file cannot be read."""
+    names = []
+    for i, file in enumerate(files):
+        with opened(file) as image:
+            ending = FORMATS.get(str(image.format))
+            gray = None if ending else image.convert("L")
+        names.append(f"{i:06d}{ending or '.png'}")
+        if gray is None:
+            os.symlink(file.resolve(), folder / names[i])
+        else:
+            gray.save(folder / names[i], compress_level=1)
+    return names
+
+
 def triangulate(images: PosedImages) -> SfmModel:
     """Points seen in several images, in the frame of their poses, and their keypoints; images are named by their
     indices.
@@ -161,12 +171,6 @@ def triangulate(images: PosedImages) -> SfmModel:
     quick search takes about a third of a second for each image on one core, the thorough one a second. Raises
     InputError if an image file cannot be read."""
     pycolmap, tracks, error = load_pycolmap(), None, np.nan
-    # By their indices as names, since two folders may contain files of the same name.
-    endings = [FORMATS.get(format_of(file)) for file in images.files]
-    names = [f"{i:06d}{ending or '.png'}" for i, ending in enumerate(endings)]
-    pairs = [(names[i], names[j]) for i, j in near_pairs(images.camera_to_worlds, NEIGHBOURS)]
-    opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
-    poses = dict(zip(names, map(sfm.rigid3d, opencv), strict=True))
     cameras = []
     for i, (width, height) in enumerate(images.sizes.astype(int).tolist()):
         lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
@@ -177,15 +181,16 @@ def triangulate(images: PosedImages) -> SfmModel:
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = LARGE
     options.sift.first_octave = -1 if images.sizes.max() <= SMALL else 0
-    for contrast, guided, least in EFFORTS:
-        if tracks is not None and len(tracks.seen_by) >= ENOUGH * len(names):
-            break
-        with sfm.quiet(), tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
-            work, database = Path(folder) / "images", Path(folder) / "database.db"
-            work.mkdir()
-            for name, file, ending in zip(names, images.files, endings, strict=True):
-                os.symlink(file.resolve(), work / name) if ending else _convert(file, work / name)
-            model = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
+    with sfm.quiet(), tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
+        work = Path(folder)
+        names = _gathered(images.files, work)
+        pairs = [(names[i], names[j]) for i, j in near_pairs(images.camera_to_worlds, NEIGHBOURS)]
+        opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
+        poses = dict(zip(names, map(sfm.rigid3d, opencv), strict=True))
+        for contrast, guided, least in EFFORTS:
+            if tracks is not None and len(tracks.seen_by) >= ENOUGH * len(names):
+                break
+            model, database = sfm.new_model(cameras, names, range(1, len(names) + 1), poses), work / f"{contrast}.db"
             sfm.write_images(model, database)
             options.sift.peak_threshold = contrast
             sfm.find_features(database, work, names, options)
@@ -200,13 +205,6 @@ def triangulate(images: PosedImages) -> SfmModel:
             tracks = read_reconstruction(model, MIN_TRACK)
     assert tracks is not None
     return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
-
-
-def _convert(file: Path, target: Path) -> None:
-    """Writes an image of a format that COLMAP does not read as a gray PNG."""
-    with opened(file) as image:
-        gray = image.convert("L")
-    gray.save(target, compress_level=1)
 
 
 def _epipolar_error(database: Path, model: Any) -> float:

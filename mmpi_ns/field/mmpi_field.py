@@ -208,7 +208,8 @@ class MMPIField(TexelTables):
         out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
         colors, slots = [out[:0]], [lookup.index[:0]]
         for k, here, part in lookup.by_head(lookup.read(lookup.features)):
-            of_samples = (part, lookup.ndc[here], lookup.rays[here], lookup.index[here])
+            index = lookup.index[here]
+            of_samples = (part, lookup.ndc[here], index // lookup.shape[1], index)
             if chosen is not None and not chosen.is_cuda:  # a GPU would be waited for
                 kept = chosen[of_samples[2]].nonzero()[:, 0]
                 of_samples = tuple(x.index_select(0, kept) for x in of_samples)
@@ -277,7 +278,7 @@ class MMPIField(TexelTables):
         """log P and log(1 - P) of the valid samples of rays, with gradients to the reliability."""
         # Shares do not move with poses.
         local = geometry.LocalRays.of(rays.origins.detach(), rays.directions.detach(), self.layout.frames)
-        places = (lookup.rays, local, samples.inverse_t.reshape(-1)[lookup.index], lookup.heads)
+        places = (lookup.index // lookup.shape[1], local, samples.inverse_t.reshape(-1)[lookup.index], lookup.heads)
         return log_shares(self.layout, self.reliability, self.touched, *places)
 
 

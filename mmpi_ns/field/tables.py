@@ -62,10 +62,6 @@ class Lookup:
     density: Float[Tensor, "U 1"]
     features: Float[Tensor, "U C"]
 
-    @property
-    def rays(self) -> Int[Tensor, "N"]:
-        return self.index // self.shape[1]
-
     def read(self, values: Float[Tensor, "U C"]) -> Float[Tensor, "N C"]:
         """Interpolated values of the samples, from those of the rows."""
         parts = [weigh_rows(values, taps.positions, taps.weights) for taps in self.taps]

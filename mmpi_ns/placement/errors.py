@@ -52,7 +52,7 @@ def mpi_errors(
     plane, across, down = pixel_slopes(mpi, observations, cameras, points)
     u0, u1, v0, v1 = mpi.extent
     texel = np.maximum(across * (u1 - u0) / (mpi.width - 1), down * (v1 - v0) / (mpi.height - 1))
-    return 0.5 * plane * mpi.depth_share / (mpi.near * (mpi.planes - 1)), texel
+    return 0.5 * plane * mpi.disparity_step, texel
 
 
 def pixel_slopes(

@@ -3,11 +3,11 @@ outliers, and independent of any order. Plain float64 NumPy."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mmpi_ns.utils.errors import InputError
 
@@ -46,26 +46,19 @@ class Observations:
     """[M, 4]: fx, fy, cx, cy in pixels."""
     sizes: Array
     """[M, 2]: width, height in pixels."""
-    points: Array
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """[P, 3] SfM points in scene units; P may be 0."""
-    seen_by: NDArray[np.int64]
+    seen_by: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """[Q] camera of each keypoint; Q may be 0."""
-    seen_point: NDArray[np.int64]
+    seen_point: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """[Q] point of each keypoint."""
-    seen_at: Array
+    seen_at: Array = field(default_factory=lambda: np.zeros((0, 2)))
     """[S, 2] pixel (x, y) of the first S <= Q keypoints, those of SfM; the others come from searched surfaces."""
     lens: Array | None = None
     """[M, G, G, 3] unit directions, in camera axes, through a grid over each image from border to border, row after
     row; None if all cameras are pinholes."""
     loose: Array | None = None
     """[L, 3] points of a cloud that does not record which images saw them (``capture/observe.py`` finds out)."""
-
-    @staticmethod
-    def of_cameras(camera_to_worlds: Array, intrinsics: ArrayLike, sizes: ArrayLike) -> Observations:
-        """Cameras of which no point is known."""
-        pinholes, none = np.array(intrinsics, np.float64), np.zeros(0, np.int64)
-        seen = np.zeros((0, 3)), none, none, np.zeros((0, 2))
-        return Observations(camera_to_worlds, pinholes, np.array(sizes, np.float64), *seen)
 
     @property
     def centers(self) -> Array:

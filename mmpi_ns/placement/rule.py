@@ -66,8 +66,6 @@ class PlacementConfig:
     """Texel columns of every MPI (drive, room)."""
     enough: float = 0.85
     """Expected error that needs no further MPI, relative to a texel's pixels (automatic)."""
-    texel_cost: float = 0.5
-    """Cost of texels: the gain of a candidate is divided by its texels to this power (automatic)."""
     max_voxels: int = 0
     """Maximum voxels along a side of a cube, if it lowers the expected error; 0: no cube (automatic)."""
     window_length: float = 5.0
@@ -206,7 +204,7 @@ class _Choice:
         self.nothing = np.full(self.cost.shape[1], self.cost.max(), np.float32)
         texels = [c.at(texel_pixels, config.max_planes, config.max_voxels).texels for c in candidates]
         self.texels = np.array(texels, dtype=np.float64)
-        self.price = self.texels**config.texel_cost
+        self.price = np.sqrt(self.texels)  # by which the gain of a candidate is divided
         self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
         self.chosen = self._choose()
 

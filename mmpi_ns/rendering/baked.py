@@ -173,8 +173,7 @@ def bake(
     numbers = [x.detach().cpu() for x in network.layers(0)]
     numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
     shader = Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.frequencies[0], MOST_CHANGE)
-    farthest = 10 * max(m.farthest for m in plan.mpis)
-    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
+    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, plan.farthest, exposure)
 
 
 def _reached(grid: TexelGrid) -> Bool[Tensor, "P Y X"]:

@@ -139,7 +139,7 @@ def _load(path: Path, *names: str) -> list[Tensor]:
 
 
 def moved_cameras(cameras: Cameras, poses: CameraOptimizer) -> Cameras:
-    """Training cameras where training has moved them."""
+    """Cameras where an optimiser of their poses has moved them."""
     if poses.config.mode == "off":
         return cameras
     moves, cameras = poses(list(range(len(cameras)))).detach(), copy(cameras)

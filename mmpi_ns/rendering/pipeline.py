@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from torch import Tensor
 
 from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.rendering.details import moved_cameras
 from mmpi_ns.rendering.exposure import exposure_of_image
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.random_draws import generator
@@ -134,13 +134,13 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
     finally:
         for p in frozen:
             p.requires_grad_(True)
-    moved = copy.deepcopy(camera)
-    moved.metadata = {"cam_idx": 0}
-    with torch.no_grad():
-        moved.camera_to_worlds = moves.apply_to_camera(moved)
     sizes: dict[str, Any] = {}
     moves.get_metrics_dict(sizes)
-    return moved, float(sizes["camera_opt_rotation_max"]), float(sizes["camera_opt_translation_max"])
+    return (
+        moved_cameras(camera, moves),
+        float(sizes["camera_opt_rotation_max"]),
+        float(sizes["camera_opt_translation_max"]),
+    )
 
 
 def summary(scores: list[tuple[str, dict[str, float]]]) -> str:

@@ -176,12 +176,11 @@ def shown_outputs(
         inverse_t = median_inverse_distance(light.weights, samples.inverse_t, samples.valid)
         winner = winning_heads(light.weights, samples.heads, field.plan.num_heads)
         dropped_mass = samples.dropped_mass
-    farthest = 10 * max(m.farthest for m in field.plan.mpis)  # stands for infinity
     return {
         "rgb": rgb,
         "accumulation": light.accumulation,
         "transmittance": light.transmittance,
-        "depth": 1 / inverse_t.clamp(min=1 / farthest),
+        "depth": 1 / inverse_t.clamp(min=1 / field.plan.farthest),
         "winning_mpi": winner,
         "dropped_mass": dropped_mass,
     }

@@ -67,11 +67,6 @@ class MPIPlan:
         return self.depth_share / (self.near * (self.planes - 1))
 
     @property
-    def farthest(self) -> float:
-        """Depth of the last plane that is not at infinity."""
-        return self.near * (self.planes - 1) if self.far == math.inf else self.far
-
-    @property
     def texels(self) -> int:
         return self.planes * self.height * self.width
 
@@ -168,6 +163,11 @@ class ScenePlan:
     def samples_per_ray(self) -> int:
         """Maximum samples of a ray: every plane, and about as many as possible in the cube."""
         return sum(m.planes for m in self.mpis) + (sum(self.cube.shape) if self.cube else 0)
+
+    @property
+    def farthest(self) -> float:
+        """Depth that stands for infinity in images: ten times that of the last plane that is not there."""
+        return 10 * max(m.near * (m.planes - 1) if m.far == math.inf else m.far for m in self.mpis)
 
     def scaled(self, factor: float) -> ScenePlan:
         """The plan at another resolution: ``factor`` times the texels, equal frames, planes and ratios of sides."""

@@ -91,7 +91,7 @@ NO_EFFECT = {
     "pipeline.model": ("enable_collider", "collider_params", "loss_coefficients", "prompt"),
 }
 """nerfstudio's options that have no effect on this method."""
-TRAINED = {"growing_rays", "tv_every"}
+TRAINED = {"growing_rays", "texel_cost", "tv_every"}
 """Options that this version lacks and that changed the training alone."""
 
 
@@ -161,15 +161,6 @@ def check_rendering() -> None:
         check_number(f"The {name} of {file}", value, POSITIVE)
 
 
-def check_device(device_type: str) -> None:
-    """Raises InputError if training is to run on a GPU that torch does not see."""
-    if device_type == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            "--machine.device-type cuda asks for a GPU, and torch sees none: "
-            f"{unused_gpu() or 'check the driver and the build of torch'}; --machine.device-type cpu trains without."
-        )
-
-
 def check_run(config: TrainerConfig) -> None:
     """Raises InputError naming the option that cannot be used, or that would be ignored."""
     model: Any = config.pipeline.model
@@ -198,6 +189,11 @@ def check_run(config: TrainerConfig) -> None:
         raise InputError("--load-step says nothing without --load-dir: give the folder of the checkpoint too.")
     if config.machine.device_type == "cpu" and (config.mixed_precision or config.use_grad_scaler):
         raise InputError("--mixed-precision and --use-grad-scaler have no effect on a CPU: leave them out.")
+    if config.machine.device_type == "cuda" and not torch.cuda.is_available():
+        raise InputError(
+            "--machine.device-type cuda asks for a GPU, and torch sees none: "
+            f"{unused_gpu() or 'check the driver and the build of torch'}; --machine.device-type cpu trains without."
+        )
     processes = config.machine.num_devices
     if processes > max(1, torch.cuda.device_count()):
         raise InputError(

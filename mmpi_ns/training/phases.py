@@ -84,7 +84,7 @@ class Schedule:
     """Steps before which empty bricks are released, judging by the samples since the previous such step or the last
     growth."""
     growing_share: float = 1.0
-    """Share of the batch drawn while resolution grows."""
+    """Share of the batch that a step draws until surfaces have formed (``sharpened``)."""
 
     @property
     def is_joint(self) -> bool:
@@ -127,10 +127,6 @@ class Schedule:
     @property
     def _sharp_from(self) -> int:
         return self.growth[-1] if self.growth else self.phases[0].end // 10
-
-    def share_of_rays(self, step: int) -> float:
-        """Share of the batch that a step draws."""
-        return 1.0 if self.sharpened(step) else self.growing_share
 
     def releases_at(self, step: int) -> bool:
         """Whether bricks are released before this step."""

@@ -182,7 +182,7 @@ class TrainingRun:
         if attributes is not None and attributes.pipeline is not None:
             manager = attributes.pipeline.datamanager
             assert isinstance(manager, MMPIDataManager), "training needs MMPIDataManager"
-            manager.share_of_rays = schedule.share_of_rays(step)
+            manager.share_of_rays = 1.0 if schedule.sharpened(step) else schedule.growing_share
             if self._drawn_from != window:
                 centers, windows = manager.observations.centers, progress.windows.windows
                 manager.use_cameras(cameras_of(windows[window], centers) if len(windows) > 1 else None)

@@ -37,7 +37,7 @@ from mmpi_ns.training.checkpoints import (
 )
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.options import check_command, check_device, check_nothing_left, check_run
+from mmpi_ns.training.options import check_command, check_nothing_left, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import WINDOWS_FOLDER, TrainingRun, WindowShare, cameras_of, views_of
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
@@ -131,7 +131,6 @@ class MMPITrainer(Trainer):
         # Images are shared among threads; those of the libraries would only spin between small operations.
         with signals_go_to(_end) if self.world_size == 1 else nullcontext(), one_thread_each():
             enter_command(training=True)
-            check_device(self.config.machine.device_type)
             if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
                 torch.cuda.set_device(self.local_rank)
             self._stopped_by: int | None = None
@@ -322,9 +321,8 @@ class MMPITrainer(Trainer):
             self._write_details(self._last_step)
             if steps := self._last_step + 1 - self._start_step:
                 say(f"Training finished: {steps:,} steps in {duration(monotonic() - self._began)}.")
-            images = self._manager.eval_dataset
-            if self._says_lines and images is not None:
-                say(quick_test(self.pipeline.model, images))
+            if self._says_lines:
+                say(quick_test(self.pipeline.model, self._manager.eval_dataset))
         say(next_commands(self.base_dir))
 
     def _write_details(self, step: int) -> None:

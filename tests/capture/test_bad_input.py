@@ -266,8 +266,8 @@ def test_a_run_resumed_with_another_number_of_mpis_is_refused_and_changes_nothin
 def test_a_gpu_asked_for_where_there_is_none(scene, plan_file, tmp_path):
     config = trainer_config(scene, plan_file, tmp_path, 4)
     config.machine.device_type = "cuda"
-    refusal(lambda: ready(config), "--machine.device-type cuda", "torch sees none", "--machine.device-type cpu")
-    assert not list(tmp_path.rglob("*.ckpt"))
+    refusal(config.save_config, "--machine.device-type cuda", "torch sees none", "--machine.device-type cpu")
+    assert not list(tmp_path.iterdir()), "before anything is written"
 
 
 def test_the_command_ends_with_the_sentence_alone_and_status_1(data, tmp_path):

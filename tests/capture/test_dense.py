@@ -8,12 +8,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
 from mmpi_ns.capture import dense
-from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, without_fringes
+from mmpi_ns.capture.dense import Depth, confirmed, find_depths, without_fringes
 from mmpi_ns.capture.views import View, camera_matrix, load_view, look_up, project
+from mmpi_ns.ops.matches import average_matches
 
 F32 = np.float32
 
@@ -244,47 +246,35 @@ def test_images_of_few_pixels_are_matched_at_their_size_alone(tmp_path, width):
     assert all(max(d.inverse.shape) == width and np.isfinite(d.inverse).all() for _, d in results)
 
 
-def test_fusing_in_strips_is_fusing_the_whole(monkeypatch):
-    rng = np.random.default_rng(0)
-    inverse = rng.choice([0.2, 0.201, 0.21, 0.3], (4, 20, 30)).astype(F32)
-    weight = rng.choice([0, 1e4, 1e6], inverse.shape).astype(F32)
-    whole = fuse(inverse, weight)
-    monkeypatch.setattr("mmpi_ns.capture.views.STRIP", 40)
-    parts = fuse(list(inverse), list(weight))
-    assert whole.inverse.any() and (whole.inverse == parts.inverse).all() and (whole.error == parts.error).all()
-
-
-def stack(*values):
-    return np.array(values, F32).reshape(len(values), 1, 1)
+def mean_of(values, weights):
+    """The mean of measurements of one pixel, and its error."""
+    columns = (torch.tensor(each).reshape(-1, 1, 1) for each in (values, weights))
+    return tuple(x.item() for x in average_matches(*columns, dense.MAX_RELATIVE))
 
 
 def test_measurements_that_agree_are_averaged_by_certainty():
-    found = fuse(stack(1.0, 1.005, 3.0), stack(1e4, 4e4, 1e8))
-    assert found.inverse[0, 0] == pytest.approx((1.0 + 4 * 1.005) / 5)
-    assert found.error[0, 0] == pytest.approx(np.sqrt(1 / 5e4))
+    inverse, error = mean_of((1.0, 1.005, 3.0), (1e4, 4e4, 1e8))
+    assert inverse == pytest.approx((1.0 + 4 * 1.005) / 5)
+    assert error == pytest.approx(np.sqrt(1 / 5e4))
 
 
 def test_an_error_is_never_less_than_the_scatter_says():
     """Errors of 0.01 each, values 0.03 apart: they agree (2.5 of sqrt 2 times 0.01), and scatter by 4.5 variances."""
-    found = fuse(stack(1.0, 1.03), stack(1e4, 1e4))
-    assert found.error[0, 0] == pytest.approx(np.sqrt(4.5 / 2e4), rel=1e-4)
+    assert mean_of((1.0, 1.03), (1e4, 1e4))[1] == pytest.approx(np.sqrt(4.5 / 2e4), rel=1e-4)
 
 
 @pytest.mark.parametrize("values", [(1.0, 1.2, 1.4), (1.0, 1.2, 0.0), (-1.0, -1.0, 0.0)])
 def test_what_no_two_of_several_measurements_say_is_not_known(values):
-    weights = np.where(stack(*values) != 0, F32(1e4), F32(0))
-    found = fuse(stack(*values), weights)
-    assert found.inverse[0, 0] == 0 and found.error[0, 0] == 0
+    assert mean_of(values, [1e4 if value else 0.0 for value in values]) == (0, 0)
 
 
 def test_a_measurement_without_another_counts():
-    found = fuse(stack(0.0, 1.0, 0.0), stack(0.0, 1e4, 0.0))
-    assert found.inverse[0, 0] == 1 and found.error[0, 0] == pytest.approx(0.01)
+    assert mean_of((0.0, 1.0, 0.0), (0.0, 1e4, 0.0)) == (1, pytest.approx(0.01))
 
 
 def test_a_depth_of_large_error_is_not_kept():
-    assert not fuse(stack(1.0, 1.0), stack(10.0, 10.0)).inverse.any()
-    assert fuse(stack(1.0, 1.0), stack(5000.0, 5000.0)).inverse.all()
+    assert mean_of((1.0, 1.0), (10.0, 10.0))[0] == 0
+    assert mean_of((1.0, 1.0), (5000.0, 5000.0))[0] > 0
 
 
 def flat_view(tmp_path, pose, gray=128):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -138,8 +137,8 @@ def test_searched_surfaces_lie_on_a_textured_wall(tmp_path, depth):
         levels = 127 + 9 * np.sin(wall @ waves.T + phases).sum(-1)
         files.append(tmp_path / f"{i}.png")
         Image.fromarray(levels.clip(0, 255).round().astype(np.uint8)).save(files[-1])
-    pinholes, sizes = np.tile([focal, focal, width / 2, height / 2], (count, 1)), np.tile([width, height], (count, 1))
-    cameras = replace(Observations.of_cameras(poses, pinholes, sizes), points=np.ones((3, 3)))
+    pinholes, sizes = (np.tile(row, (count, 1)) for row in ([focal, focal, width / 2, height / 2], [width, height]))
+    cameras = Observations(poses, pinholes, sizes.astype(float), points=np.ones((3, 3)))
     found = with_surfaces(cameras, PosedImages(tuple(files), poses, pinholes, sizes, np.zeros((count, 4))))
     assert np.array_equal(found.points[:3], np.ones((3, 3))) and len(found.points) > 500 and not len(found.seen_at)
     assert np.percentile(np.abs(found.points[3:, 2] + depth), 80) < 0.1 * depth

@@ -167,7 +167,7 @@ def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, 
 
 def keypoints_of(model, images):
     """Image, point and relative place of each keypoint."""
-    cameras = Observations.of_cameras(images.camera_to_worlds, images.intrinsics, images.sizes)
+    cameras = Observations(images.camera_to_worlds, images.intrinsics, images.sizes)
     seen = with_tracks(cameras, model)
     return seen.seen_by, seen.seen_point, seen.seen_at / images.sizes[seen.seen_by]
 

@@ -34,7 +34,7 @@ def test_an_option_that_left_and_changes_the_images_is_named():
 
 def test_an_option_that_left_and_changed_the_training_alone_is_passed_over():
     model = model_of(yaml.dump(mmpi_small.config))
-    model.schedule.growing_rays = model.loss.tv_every = 1
+    model.schedule.growing_rays = model.loss.tv_every = model.placement.texel_cost = 1
     check_nothing_left(model)
 
 

@@ -12,7 +12,7 @@ from training_runs import trainer_config
 
 from mmpi_ns.config import mmpi_small
 from mmpi_ns.training import trainer as trainer_module
-from mmpi_ns.training.options import check_device
+from mmpi_ns.training.options import check_run
 from mmpi_ns.utils import machine
 from mmpi_ns.utils.errors import InputError
 
@@ -103,11 +103,13 @@ def system(monkeypatch, tmp_path):
         ("580.65.06", "13.0", ["does not start", "torch.cuda.init()"]),
     ],
 )
-def test_a_gpu_that_torch_does_not_see_is_named_with_what_mends_it(system, driver, cuda, words):
+def test_a_gpu_that_torch_does_not_see_is_named_with_what_mends_it(system, tmp_path, driver, cuda, words):
     system(driver, cuda)
+    config = trainer_config(tmp_path, None, tmp_path)
+    config.machine.device_type = "cuda"
     assert all(word in machine.unused_gpu() for word in words)
     with pytest.raises(InputError, match="RTX 3090"):
-        check_device("cuda")
+        check_run(config)
 
 
 def test_nothing_is_said_of_a_gpu_that_is_used_hidden_or_not_there(system, monkeypatch):

@@ -150,15 +150,15 @@ def test_texels_double_four_times_as_early_where_depths_are_known_and_the_releas
 
 def test_half_of_the_batch_is_drawn_while_texels_grow_from_known_surfaces():
     fog, known = (make_schedule(ScheduleConfig(), 3_000, 2, depths_known=known) for known in (False, True))
-    shares = [known.share_of_rays(step) for step in range(6_000)]
-    assert known.growth[-1] == 200 and shares == 2 * (200 * [0.5] + 2_800 * [1.0])
-    assert all(fog.share_of_rays(step) == 1.0 for step in range(6_000))
-    assert Schedule.from_json(known.to_json()).share_of_rays(0) == 0.5
-    short = [make_schedule(ScheduleConfig(), n, depths_known=True).share_of_rays(0) for n in (1, 1_250, 2_000, 2_500)]
+    formed = [known.sharpened(step) for step in range(6_000)]
+    assert known.growth[-1] == 200 and formed == 2 * (200 * [False] + 2_800 * [True])
+    assert known.growing_share == 0.5 and fog.growing_share == 1.0
+    assert Schedule.from_json(known.to_json()).growing_share == 0.5
+    short = [make_schedule(ScheduleConfig(), n, depths_known=True).growing_share for n in (1, 1_250, 2_000, 2_500)]
     assert short == [1.0, 1.0, 0.625, 0.5]
     text = json.loads(known.to_json())
     del text["growing_share"]
-    assert Schedule.from_json(json.dumps(text)).share_of_rays(0) == 1.0, "of a run of an earlier version"
+    assert Schedule.from_json(json.dumps(text)).growing_share == 1.0, "of a run of an earlier version"
 
 
 def test_texels_may_become_finer_at_releases_after_growth_while_rates_are_high():
