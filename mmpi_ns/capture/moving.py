@@ -28,7 +28,7 @@ from mmpi_ns.capture.moving_carry import Carried, carried
 from mmpi_ns.capture.moving_doubt import doubt_of
 from mmpi_ns.capture.moving_evidence import Evidence, Mask, Neighbour, Shot, evidence, ground_of
 from mmpi_ns.capture.moving_follow import upright_objects
-from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds
+from mmpi_ns.capture.moving_objects import UNASKED, followed, grown, is_static, seeds, touching
 from mmpi_ns.capture.moving_outline import outlined
 from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
@@ -66,7 +66,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 18
+VERSION = 19
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -349,8 +349,9 @@ def _followed_on(
 
     def everywhere(i: int) -> Mask:
         carry = along_path(i)
-        return by_flow(i) | carry.pixels | carry.objects
+        return by_flow(i) | carry.pixels | carry.objects | (uprights[i] & ~touching(uprights[i], masks[i]))
 
+    uprights = upright_objects(shots, near, masks, pool)
     before, masks = masks, followed_to(looks, everywhere)
     for _ in range(FURTHER):
         aside = [reaches_side(mask & ~old) for mask, old in zip(masks, before, strict=True)]

@@ -32,8 +32,8 @@ LEAST_AREA, LEAST_SIDE = 30, 4
 DEPTHS, REACH, APART = 24, 1.2, 1.5
 """Inverse depths that something static may have, up to this multiple of the nearest content's, and pixels between where
 they put an object and where it was, from which on it moves."""
-INNER = 3
-"""Pixels across which an object is shrunk: its outline is uncertain."""
+INNER = 2
+"""Pixels across which an object is shrunk at half the size: its outline is uncertain."""
 AGAIN = 0.5
 """Share of what is followed that is masked anyway in one image, at least: what is seen to move once may be wrong."""
 

@@ -39,7 +39,7 @@ UNASKED = -1
 """Instead of the levels of a pixel that was no candidate so far."""
 DENSITY, AROUND = 0.35, 7
 """Share of seeds in a window of this many pixels around a seed that is kept."""
-LEAST_PIXELS, LEAST_SIDE = 20, 4
+LEAST_PIXELS, LEAST_SIDE = 15, 4
 """Seeds of an object, and the shorter side of what they span, pixels at working size."""
 TOGETHER = 15
 """Pixels across which seeds belong to one object."""
@@ -48,6 +48,8 @@ TALL = 1.15
 NARROW, UPRIGHT, LOW = 0.4, 1.05, 0.8
 """Width over the height of the camera below which an object is a person, as tall as the second, with a head of other
 colours than its body; others are filled up to the third."""
+SHADED = 0.8
+"""The same for a person with a shadow on the ground: it is filled up only between the columns of its upper seeds."""
 CORE = 0.1
 """Share of an object that seeds cover, at least, and half of it where neighbours say nothing: else it is a strip that
 fell out of what stands."""
@@ -195,7 +197,12 @@ def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int,
     result = part.copy()
     result[inside] |= perhaps[inside] & (cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_LINEAR) > 0.5)
     # The colours of an object may be those around it; what stands in the columns above its seeds is its body.
-    columns_of = part.any(0)
+    columns_of, last_row = part.any(0), int(np.flatnonzero(part.any(1))[-1])
+    upper = np.flatnonzero(part[: (body + last_row) // 2].any(0))
+    if shot.horizon is not None and len(upper) >= LEAST_SIDE:
+        below = last_row - float(shot.horizon[columns_of].mean())
+        if np.ptp(np.flatnonzero(columns_of)) < SHADED * below:  # what lies beside the feet is a shadow
+            columns_of[: upper[0]] = columns_of[upper[-1] + 1 :] = False
     first, last = part.argmax(0), height - 1 - part[::-1].argmax(0)
     y = np.arange(height)[:, None]
     result |= columns_of & (y >= np.minimum(first, body)) & (y <= last) & ~static

@@ -190,6 +190,22 @@ def test_only_what_a_second_look_shows_by_itself_is_followed_by_flow_and_along_t
     assert all((mask == car | by_flow).all() for mask in masks)
 
 
+def test_people_are_followed_from_a_second_look_too_where_they_are_not_masked_yet(monkeypatch):
+    """The search in what the first look shows finds nobody."""
+    first, second, body, stranger = np.zeros((4, 20, 50), bool)
+    first[:, 2:5], second[:, 20:30], body[:, 29:35], stranger[:, 40:45] = True, True, True, True
+    searched = []
+
+    def upright_objects(shots, near, masks, pool):
+        searched.append(masks)
+        return [body | stranger if len(searched) > 1 else np.zeros_like(body)] * len(shots)
+
+    masks = five_in_a_row(monkeypatch, [second] * 5, first, upright_objects=upright_objects)
+    for before, expected in zip(searched, (first, second), strict=True):
+        assert all((mask == expected).all() for mask in before)
+    assert all((mask == second | stranger).all() for mask in masks)
+
+
 def test_outlines_are_drawn_of_all_that_was_followed(monkeypatch):
     car, by_flow = np.zeros((2, 20, 50), bool)
     car[:, 20:30], by_flow[:, 30:34] = True, True

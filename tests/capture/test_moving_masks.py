@@ -327,6 +327,19 @@ def test_a_narrow_thing_reaches_the_horizon_also_in_the_colours_behind_it(width,
     assert mask[14:19, 31 : 29 + width].mean() == reaches
 
 
+@pytest.mark.parametrize(("left", "filled"), [(16, False), (4, True)], ids=["somebody's shadow", "a car"])
+def test_what_is_above_a_shadow_beside_the_feet_of_somebody_is_not_filled(left, filled):
+    """Seeds on a body and, left of it, in the lowest rows."""
+    color = np.random.default_rng(0).integers(80, 100, (*SIZE, 3)).astype(np.uint8)
+    core = np.zeros(SIZE, bool)
+    core[23:55, 30:40] = core[51:55, left:30] = True
+    color[23:55, 30:40] += 100
+    color[51:55, left:30] -= 70
+    mask = grown(*a_scene(color, horizon=14), core)
+    assert mask[24:54, 31:39].all() and mask[52:54, left:30].all()
+    assert mask[26:44, left + 2 : 28].mean() == filled
+
+
 @pytest.mark.parametrize(("apart", "kept"), [(6, True), (13, False)])
 def test_an_object_that_seeds_hardly_cover_is_none(apart, kept):
     core = np.zeros(SIZE, bool)
