@@ -66,7 +66,7 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 19
+VERSION = 20
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -303,7 +303,7 @@ def _moves(
     levels = first.levels if first else np.full(uprights.shape, UNASKED, np.int16)
     shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
     walkers = first.walkers if first else np.zeros_like(uprights)
-    if first is None and len(shot.people):
+    if first is None and len(shot.people.boxes):
         walkers = grown(shot, shown, walkers)
     core = uprights | (swept.certain & ~is_static(shot, shown))
     if len(others) >= 2:

@@ -9,7 +9,7 @@ or if an impossible depth explains it (``moving_sweep.py``).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.dense import Depth
+from mmpi_ns.capture.people import NOBODY, People
 from mmpi_ns.capture.views import Map, Parallax, View, pixel_grid
 
 Bytes = NDArray[np.uint8]
@@ -61,8 +62,8 @@ class Shot:
     """Inverse depth of the ground, 0 near the horizon and above; None where no ground is found. [h, w]"""
     horizon: NDArray[np.float64] | None = None
     """Row of the horizon in each column, where a ground is found. [w]"""
-    people: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 4), int))
-    """Left, top, right and bottom of what looks like a person. [n, 4]"""
+    people: People = NOBODY
+    """What looks like people."""
     level: NDArray[np.float64] | None = None
     """The horizon also where no ground is found; None where the camera looks steeply up or down. [w]"""
 

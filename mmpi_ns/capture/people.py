@@ -8,6 +8,8 @@ height in the image.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
@@ -26,12 +28,25 @@ LEVELS, FINER, CELL = 40, 1.1, 8
 """Sizes that are searched at most, their ratio, and pixels from one window of the detector to the next."""
 TALL, SPARE = 96, 24
 """Pixels of a person in the detector's window, and beyond those that are searched above and below."""
-SCORE, ALIKE = 0.6, 0.2
-"""Of the detector, least, for one of the windows that show a person alike but for this share of their size."""
+ALIKE = 0.2
+"""Share of their size by which windows of the detector that show the same person differ, at most."""
 HEIGHTS = (0.6, 1.3)
 """Height of the camera over that of a person."""
 MARGIN = np.array([1 / 8, 1 / 8])
 """Around the person in the detector's window, at each side, as a share of its width and height."""
+
+
+@dataclass(frozen=True)
+class People:
+    """What looks like people in an image."""
+
+    boxes: Int[ndarray, "N 4"]
+    """Left, top, right and bottom, in pixels of its view at working size."""
+    scores: Float[ndarray, "N"]
+    """Of the detector, the best of windows that show the same; above 0."""
+
+
+NOBODY = People(np.zeros((0, 4), int), np.zeros(0))
 
 
 def has_detector() -> bool:
@@ -55,8 +70,8 @@ def horizon_of(view: View, up: Float[ndarray, "3"]) -> Float[ndarray, "w"] | Non
     return cy - fy * (right * x + ahead) / down
 
 
-def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) -> Int[ndarray, "N 4"]:
-    """Left, top, right and bottom of the people in an image, in pixels of its view at working size.
+def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) -> People:
+    """What looks like people in an image, stands on the ground and is as tall as people are.
 
     Args:
         images: the originals.
@@ -64,16 +79,16 @@ def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) 
         view: the same at working size.
         up: unit vector in the world.
     """
-    nobody, horizon = np.zeros((0, 4), int), horizon_of(view, up)
+    horizon = horizon_of(view, up)
     if horizon is None or not has_detector():
-        return nobody
+        return NOBODY
     wide = load_view(images, i, SIDE)
     height, width = wide.gray.shape
     scale = min(ENLARGED, SIDE / max(height, width))
     level = float(horizon.mean()) * height / view.gray.shape[0]
     first, last = (int(np.clip(level + share * width, 0, height)) for share in (-ABOVE, BELOW))
     if last <= first:
-        return nobody
+        return NOBODY
     gray = cv2.resize(wide.gray[first:last], None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
     ends = scale * (horizon[[0, -1]] * height / view.gray.shape[0] - first)  # of the horizon, in these rows
     detector = cv2.HOGDescriptor()
@@ -95,10 +110,11 @@ def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) 
     every, score = np.concatenate(placed).astype(int), np.concatenate(scores)
     grouped = np.reshape(cv2.groupRectangles(every.tolist(), 1, ALIKE)[0], (-1, 4)).astype(np.float64)
     alike = np.abs(every - grouped[:, None]).max(-1) <= ALIKE * grouped[:, 2:].mean(-1)[:, None]
-    windows = grouped[np.where(alike, score, 0).max(-1, initial=0) > SCORE]  # left, top, width and height
-    low, extent = windows[:, :2] + MARGIN * windows[:, 2:], (1 - 2 * MARGIN) * windows[:, 2:]
+    best = np.where(alike, score, 0).max(-1, initial=0)
+    low, extent = grouped[:, :2] + MARGIN * grouped[:, 2:], (1 - 2 * MARGIN) * grouped[:, 2:]
     boxes = (np.concatenate([low, low + extent], -1) / scale + [0, first, 0, first]) * view.gray.shape[0] / height
     camera = (boxes[:, 3] - np.interp(boxes[:, [0, 2]].mean(1), np.arange(len(horizon)) + 0.5, horizon)) / (
         boxes[:, 3] - boxes[:, 1]
     )
-    return boxes[(camera > HEIGHTS[0]) & (camera < HEIGHTS[1])].round().astype(int)
+    standing = (camera > HEIGHTS[0]) & (camera < HEIGHTS[1])
+    return People(boxes[standing].round().astype(int), best[standing])

@@ -13,6 +13,7 @@ from mmpi_ns.capture import moving
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving import WALKERS, find_moving, key_images
 from mmpi_ns.capture.moving_evidence import Shot
+from mmpi_ns.capture.people import NOBODY
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View
 
@@ -67,7 +68,7 @@ def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatc
     monkeypatch.setattr(moving, "_moves", moves)
     for name in ("_followed_on", "_outlined"):
         monkeypatch.setattr(moving, name, lambda shots, near, masks, *_: masks)
-    monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
+    monkeypatch.setattr(moving, "people_in", lambda *_: NOBODY)
     _, masks, _ = find_moving(aside(*np.arange(49) * 0.0099), lambda i: wall())
     assert compared == [list(range(0, 49, 2))]
     assert sorted(looked_at[:9]) == [*range(0, 49, 6)]
@@ -96,7 +97,7 @@ def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_i
     margin = np.arange(1000).reshape(20, 50) >= 990  # of outlines, which does not count
     monkeypatch.setattr(moving, "_followed_on", lambda shots, near, masks, *_: masks)
     monkeypatch.setattr(moving, "_outlined", lambda shots, near, masks, *_: [mask | margin for mask in masks])
-    monkeypatch.setattr(moving, "people_in", lambda *_: np.zeros((0, 4), int))
+    monkeypatch.setattr(moving, "people_in", lambda *_: NOBODY)
     poses = np.tile(np.eye(4)[:3], (5, 1, 1))
     poses[:, 0, 3] = range(5)
     images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile([50.0, 20], (5, 1)), np.zeros((5, 4)))

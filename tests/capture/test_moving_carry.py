@@ -19,6 +19,7 @@ from mmpi_ns.capture.moving import reaches_side
 from mmpi_ns.capture.moving_carry import Carried, carried, whole_objects
 from mmpi_ns.capture.moving_evidence import Neighbour, Shot
 from mmpi_ns.capture.moving_objects import followed
+from mmpi_ns.capture.people import NOBODY
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View
 
@@ -141,7 +142,7 @@ def five_in_a_row(monkeypatch, second: list[np.ndarray], first: np.ndarray, **pa
         return mask, moving._Look([np.ones(3)] * len(near), unused, unused, np.zeros_like(mask), unused, mask)
 
     replaced = {
-        "find_depths": lambda *_: iter(shots), "people_in": lambda *_: np.zeros((0, 4), int), "_moves": moves,
+        "find_depths": lambda *_: iter(shots), "people_in": lambda *_: NOBODY, "_moves": moves,
         "_outlined": lambda shots, near, masks, *_: masks,
         "neighbours": lambda images, i, keys: [j for j in (i - 1, i + 1) if 0 <= j < 5],
         "num_threads": lambda: 1,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -12,7 +13,7 @@ from mmpi_ns.capture import moving
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving_evidence import Evidence, Shot
-from mmpi_ns.capture.moving_objects import grown
+from mmpi_ns.capture.moving_objects import SURE, grown
 from mmpi_ns.capture.people import horizon_of, people_in
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.upright import upright
@@ -54,7 +55,9 @@ def of_a_level_camera(folder, image, pitch=0.0):
 
 def found(folder, image, pitch=0.0):
     images, view = of_a_level_camera(folder, image, pitch)
-    return people_in(images, 0, view, UP) * WIDTH / 384
+    people = people_in(images, 0, view, UP)
+    assert (people.scores > 0).all() and len(people.scores) == len(people.boxes)
+    return people.boxes[people.scores > SURE] * WIDTH / 384
 
 
 def test_the_horizon_is_where_what_lies_level_appears(tmp_path):
@@ -128,18 +131,28 @@ def test_masks_made_without_a_detector_are_made_again_with_one(tmp_path, monkeyp
     assert searches == [False, True]
 
 
-@pytest.mark.parametrize("is_static", [False, True])
-def test_a_person_is_masked_unless_its_depth_explains_it(tmp_path, is_static):
-    image = figure(COLUMN, FEET)
-    images, view = of_a_level_camera(tmp_path, image)
+@pytest.mark.parametrize(
+    ("score", "seen", "is_static", "masked"),
+    [(0.7, 0.0, False, True), (0.7, 1.0, True, False), (0.1, 0.0, False, False), (0.1, 0.4, False, True)],
+    ids=["sure", "its depth explains it", "unsure", "unsure and seen to move"],
+)
+def test_a_person_is_masked_if_sure_or_seen_to_move_unless_its_depth_explains_it(
+    tmp_path, score, seen, is_static, masked
+):
+    """Seen to move in a share of its rows."""
+    images, view = of_a_level_camera(tmp_path, figure(COLUMN, FEET))
     inverse = np.full(view.gray.shape, float(is_static), np.float32)
     nothing = np.zeros(view.gray.shape, np.uint8)
     people = people_in(images, 0, view, UP)
+    assert len(people.boxes) == 1 and people.scores[0] > SURE
+    strong = nothing.copy()
+    top, bottom = people.boxes[0, [1, 3]]
+    strong[top : top + round(seen * (bottom - top))] = 50
     color = np.asarray(straightened_color(images, 0, view), np.uint8)
-    shot = Shot(view, color, Depth(inverse, 0.01 * inverse), None, None, people)
-    mask = grown(shot, Evidence(nothing, nothing, nothing, nothing == 0, 0.0), nothing > 0)
+    shot = Shot(view, color, Depth(inverse, 0.01 * inverse), None, None, replace(people, scores=np.array([score])))
+    mask = grown(shot, Evidence(strong, nothing, nothing, nothing == 0, 0.0), nothing > 0)
     truth = view.gray < 90
-    if is_static:
-        assert not mask.any()
-    else:
+    if masked:
         assert mask[truth].mean() > 0.7 and mask[~truth].mean() < 0.01
+    else:
+        assert not mask.any()
