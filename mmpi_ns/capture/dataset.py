@@ -142,7 +142,13 @@ class MMPIDataset(InputDataset):
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def check_files(self) -> None:
-        """Raises InputError for an image that cannot be opened, or is not as large as its camera; reads no pixels."""
+        """Raises InputError for an image that cannot be opened, or is not as large as its camera, and for a depth image
+        that is missing; reads no pixels."""
+        for file in map(Path, self.metadata.get("depth_filenames") or ()):
+            try:
+                file.stat()
+            except OSError as error:
+                raise InputError(f"Depth image {file} cannot be read ({brief(error)}): repair or remove it.") from error
         for i, name in enumerate(self.image_filenames):
             with opened(name) as image:
                 columns, rows = (int(side * self.scale_factor) for side in image.size)
