@@ -9,6 +9,7 @@ changed for a block is a context manager below. No other module of the method as
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 import signal
 import stat
@@ -102,12 +103,23 @@ def _hide_notices() -> Iterator[None]:
 
 @contextmanager
 def _outlive_readers() -> Iterator[None]:
-    """CONSOLE.on_broken_pipe: a pipe that nobody reads any more ends no work, as rich would: Ctrl-C ends ``| tee`` at
-    once, and a training after it has saved."""
+    """CONSOLE.on_broken_pipe, CONSOLE._check_buffer: a pipe that nobody reads any more, or a closed terminal, ends no
+    work, as rich would: Ctrl-C ends ``| tee`` at once, and a training after it has saved; a terminal refuses every word
+    before its signal comes."""
+    plain = CONSOLE._check_buffer
 
-    vars(CONSOLE).update(on_broken_pipe=lambda: discard(1))
+    def check_buffer() -> None:
+        try:
+            plain()
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            discard(1)
+
+    vars(CONSOLE).update(on_broken_pipe=lambda: discard(1), _check_buffer=check_buffer)
     yield
-    vars(CONSOLE).pop("on_broken_pipe", None)
+    for name in ("on_broken_pipe", "_check_buffer"):
+        vars(CONSOLE).pop(name, None)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import errno
+import os
 import signal
 import subprocess
 import sys
@@ -40,7 +41,7 @@ LISTED = {
 def state():
     """What PATCHES change, but for malloc, which cannot be asked."""
     handlers = tuple(signal.getsignal(number) for number in host.SIGNALS)
-    console = {name: vars(CONSOLE).get(name) for name in ("print", "log", "on_broken_pipe")}
+    console = {name: vars(CONSOLE).get(name) for name in ("print", "log", "on_broken_pipe", "_check_buffer")}
     return (
         sys.excepthook,
         tuple(warnings.filters),
@@ -181,6 +182,23 @@ def test_an_input_error_is_one_sentence_and_others_keep_their_traceback(monkeypa
     sys.excepthook(KeyError, KeyError("x"), None)
     sys.excepthook(OSError, OSError(errno.ENOENT, "No such file or directory"), None)
     assert len(shown) == 2
+
+
+def test_a_closed_terminal_ends_no_work(monkeypatch, mallocs):
+    """Its signal comes a moment later."""
+    monkeypatch.setattr(sys, "argv", ["ns-train"])
+    reader, terminal = os.openpty()
+    discarded = []
+    host.enter_command()
+    with open(terminal, "w") as output:
+        monkeypatch.setattr(CONSOLE, "file", output)
+        monkeypatch.setattr(host, "discard", lambda number: discarded.append(number) or os.dup2(null, terminal))
+        CONSOLE.print("step 10")
+        os.close(reader)
+        with open(os.devnull, "w") as nothing:
+            null = nothing.fileno()
+            CONSOLE.print("step 20")
+    assert discarded == [1]
 
 
 def fail(error):
