@@ -1,4 +1,4 @@
-"""ns-render of runs: what it cannot show is said before it begins, and what it can comes out (docs/errors.md)."""
+"""ns-render and mmpi-export of runs: what cannot be shown is said before it begins, and what can comes out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
-from forked import start, train
+from forked import run, start, train
 from PIL import Image
 from tiny_scene import HEIGHT, TEST, WIDTH, name_of, write_scene
 
@@ -39,10 +39,10 @@ def test_ns_render_names_the_only_test_image_which_is_no_path(whole_scene, tmp_p
     meta |= {f"{split}_filenames": meta["test_filenames"][:1] for split in ("val", "test")}
     (data / "transforms.json").write_text(json.dumps(meta))
     assert train(data, tmp_path).status == 0
-    run, images = tmp_path / "tiny/mmpi-small/run", ("--output-format", "images", "--interpolation-steps", "2")
-    said = render(run, tmp_path, "interpolate", *images).sentence
+    folder, images = tmp_path / "tiny/mmpi-small/run", ("--output-format", "images", "--interpolation-steps", "2")
+    said = render(folder, tmp_path, "interpolate", *images).sentence
     assert name_of(TEST[0]) in said and "--pose-source train" in said
-    assert render(run, tmp_path, "interpolate", *images, "--pose-source", "train").shown
+    assert render(folder, tmp_path, "interpolate", *images, "--pose-source", "train").shown
 
 
 @pytest.mark.parametrize("what", ["dataset", "interpolate"])
@@ -135,3 +135,14 @@ def test_ns_render_shows_see_through_originals_over_its_background(tmp_path):
     np.testing.assert_array_equal(shown[quarter:], stored[quarter:, :, :3])
     options = ("--output-format", "images", "--render-nearest-camera", "True", "--interpolation-steps", "1")
     assert render(folder, tmp_path, "interpolate", *options).shown
+
+
+def test_an_export_that_was_interrupted_is_begun_anew(trained, tmp_path):
+    command = ("mmpi-export", "web", "--load-config", trained / "config.yml", "--output", tmp_path / "site")
+    assert "Wrote" in run(*command).shown
+    whole = {path.name: path.read_bytes() for path in (tmp_path / "site").iterdir()}
+    (tmp_path / "site/scene.json").unlink()
+    for name in ("window-00001.bin", ".window-00001.bin.77.tmp", ".scene.json.77.tmp"):
+        (tmp_path / "site" / name).write_bytes(b"half")
+    assert "Wrote" in run(*command).shown
+    assert {path.name: path.read_bytes() for path in (tmp_path / "site").iterdir()} == whole

@@ -351,17 +351,6 @@ def test_mmpi_export_names_the_option_that_cannot_be_used(trained, tmp_path, opt
     assert not (tmp_path / "out").exists()
 
 
-def test_an_export_that_was_interrupted_is_begun_anew(trained, tmp_path):
-    command = ("mmpi-export", "web", "--load-config", trained / "config.yml", "--output", tmp_path / "site")
-    assert "Wrote" in run(*command).shown
-    whole = {path.name: path.read_bytes() for path in (tmp_path / "site").iterdir()}
-    (tmp_path / "site/scene.json").unlink()
-    for name in ("window-00001.bin", ".window-00001.bin.77.tmp", ".scene.json.77.tmp"):
-        (tmp_path / "site" / name).write_bytes(b"half")
-    assert "Wrote" in run(*command).shown
-    assert {path.name: path.read_bytes() for path in (tmp_path / "site").iterdir()} == whole
-
-
 @pytest.mark.parametrize(("format", "name"), [("bake", "out"), ("splats", "out/scene.ply")])
 def test_mmpi_export_names_a_folder_that_cannot_be_written_before_it_bakes(trained, tmp_path, format, name):
     (tmp_path / "notes.txt").write_text("a file")
