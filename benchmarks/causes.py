@@ -16,13 +16,13 @@ from plane_crossings import images_of
 from report import Bench, Report, Row, page, table
 from torch import Tensor
 
-from mmpi_ns.capture.observe import posed_images
-from mmpi_ns.capture.views import look_up, project
-from mmpi_ns.export.bake import load_model
 from mmpi_ns.rendering.metrics import color_corrected
 from mmpi_ns.rendering.pipeline import refined_camera
 from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.errors import InputError
+from mmpi_priors.observe import posed_images
+from mmpi_priors.views import look_up, project
+from mmpi_show.bake import load_model
 
 Mask = NDArray[np.bool_]
 

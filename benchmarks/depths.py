@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from report import Bench, Report, Row, page, table
 
-from mmpi_ns.capture import cache
-from mmpi_ns.capture.dataset import read_depth_image
 from mmpi_ns.config import mmpi_small
+from mmpi_ns.data.dataset import read_depth_image
 from mmpi_ns.scripts.command import run
+from mmpi_priors import cache
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 

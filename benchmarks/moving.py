@@ -18,12 +18,12 @@ from PIL import Image
 from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene
-from mmpi_ns.capture.dense import find_depths
-from mmpi_ns.capture.moving import COMPARED, ROUNDS, SIDE, key_images, moving_masks
-from mmpi_ns.capture.observe import posed_images
-from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.config import mmpi_small
 from mmpi_ns.scripts.command import run
+from mmpi_priors.dense import find_depths
+from mmpi_priors.moving import COMPARED, ROUNDS, SIDE, key_images, moving_masks
+from mmpi_priors.observe import posed_images
+from mmpi_priors.tracks import at_full_size
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 from mmpi_scene.movers import MOVER, with_movers

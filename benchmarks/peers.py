@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mmpi_ns.capture.dataset import parser_points
+from mmpi_ns.data.dataset import parser_points
 from mmpi_ns.ops.interpolate import weigh_rows
 
 
@@ -47,7 +47,7 @@ def give_depths(data: Path, downscale_factor: int) -> None:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
     from nerfstudio.data.datasets.depth_dataset import DepthDataset, InputDataset
 
-    from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
+    from mmpi_ns.data.datamanager import MMPIDataManagerConfig
 
     parser = NerfstudioDataParserConfig(data=data, downscale_factor=downscale_factor)
     manager = MMPIDataManagerConfig(data=data, dataparser=parser).setup(device="cpu", test_mode="val")

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from report import Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene
-from mmpi_ns.prepare.adjustment import degrees_between
 from mmpi_ns.scripts.command import run
+from mmpi_prepare.adjustment import degrees_between
 
 Array = NDArray[np.float64]
 MODES = {"as they are": "off", "refined in training": "SO3xR3"}

@@ -18,9 +18,9 @@ from captures import Array, Truth, catalogue
 from lab import not_run
 from report import Bench, Report, Row, commit, page, table
 
-from mmpi_ns.prepare.adjustment import degrees_between, nearest_rotation
-from mmpi_ns.prepare.pipeline import WORK
 from mmpi_ns.scripts.command import run
+from mmpi_prepare.adjustment import degrees_between, nearest_rotation
+from mmpi_prepare.pipeline import WORK
 
 WRONG = (0.01, 0.03)
 """Mean and largest error of the camera centres, as shares of the length of the track, from which a track is wrong."""
@@ -84,7 +84,7 @@ class Prepare(Bench):
 def run_prepare(images: Path, scene: Path, options: list[str]) -> Row:
     """mmpi-prepare in a process of its own: its verdict, its last words, and its time."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    command = [sys.executable, "-m", "mmpi_ns.scripts.prepare", str(images), str(scene), *options]
+    command = [sys.executable, "-m", "mmpi_prepare.__main__", str(images), str(scene), *options]
     made = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "120"})
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     said = [line for line in made.stdout.splitlines() if line.startswith(("mmpi-prepare:", "This scene is"))]

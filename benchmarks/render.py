@@ -20,12 +20,12 @@ from random_scenes import Array, in_float64
 from random_scenes import render as render_plainly
 from report import Bench, Report, Row, fingerprint, page, table
 
-from mmpi_ns.export.bake import load_model
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.rendered import BACKGROUNDS, bounded
 from mmpi_ns.scripts.command import run
+from mmpi_show.bake import load_model
 
 EXACT_RAYS = 256
 """Rays that are rendered exactly at once."""

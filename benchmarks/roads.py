@@ -18,7 +18,7 @@ from PIL import Image
 from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene, config_of, trainer_of
-from mmpi_ns.capture.datamanager import load_observations
+from mmpi_ns.data.datamanager import load_observations
 from mmpi_ns.ops.march import MarchOptions, march
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.metrics import ImageMetrics

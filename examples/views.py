@@ -12,7 +12,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.eval_utils import eval_setup
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.data.datamanager import MMPIDataManager
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.rendering.metrics import head_palette

@@ -10,7 +10,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
+from mmpi_ns.data.datamanager import MMPIDataManagerConfig
 from mmpi_ns.field.mmpi_field import ColourConfig
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import DEFAULTS

@@ -16,14 +16,14 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 
-from mmpi_ns.capture.rays import image_rays
-from mmpi_ns.export.bake import read_run_config
-from mmpi_ns.export.files import HEADER, read_baked
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.values import Number, check_number
+from mmpi_show.bake import read_run_config
+from mmpi_show.files import HEADER, read_baked
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,8 @@ from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
 
-from mmpi_ns.capture.datamanager import DEPTHS_KNOWN, GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
-from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.data.datamanager import DEPTHS_KNOWN, GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.layout import Shapes
@@ -28,7 +28,6 @@ from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
-from mmpi_ns.rendering.baked import BakedWindow, bake, why_not_baked
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
@@ -55,6 +54,7 @@ from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
+from mmpi_show.windows import BakedWindow, bake, why_not_baked
 
 
 @dataclass

@@ -10,9 +10,9 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from random_bricks import random_window, scene_of
 
-from mmpi_ns.export.details import stored_view
-from mmpi_ns.export.files import BakedScene
 from mmpi_ns.rendering.details import Details, details_of, write_details
+from mmpi_show.details import stored_view
+from mmpi_show.files import BakedScene
 
 HEIGHT, WIDTH = 36, 52
 LENSES = [[0.0] * 6, [0.2, -0.06, 0.02, 0.01, 0.03, -0.02], [0.05, -0.02, 0.0, 0.0, 0.0, 0.0]]

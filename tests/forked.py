@@ -21,7 +21,7 @@ COMMANDS = {
     "ns-viewer": "nerfstudio.scripts.viewer.run_viewer",
     "mmpi-plan": "mmpi_ns.scripts.plan",
     "mmpi-scene": "mmpi_scene.__main__",
-    "mmpi-export": "mmpi_ns.scripts.export",
+    "mmpi-export": "mmpi_show.__main__",
     "mmpi-bench": "mmpi_ns.scripts.bench",
 }
 CALM = {
@@ -34,7 +34,7 @@ CALM = {
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 _context = multiprocessing.get_context("forkserver")
-_context.set_forkserver_preload([*COMMANDS.values(), "mmpi_ns.config", "mmpi_ns.capture.datamanager", "pycolmap"])
+_context.set_forkserver_preload([*COMMANDS.values(), "mmpi_ns.config", "mmpi_ns.data.datamanager", "pycolmap"])
 
 
 @dataclass(frozen=True)

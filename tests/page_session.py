@@ -20,11 +20,11 @@ import torch
 import tyro
 from browser import browser, served
 
-from mmpi_ns.capture.rays import image_rays
-from mmpi_ns.export.bake import bake_run, load_model
-from mmpi_ns.export.files import read_header, write_baked
-from mmpi_ns.export.web import write_page
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_show.bake import bake_run, load_model
+from mmpi_show.files import read_header, write_baked
+from mmpi_show.web import write_page
 
 LEAST_DB, MOST_LOST = 38.0, 0.1
 WHOLE = "[...mmpi.windows.values()].every((w) => w && w.whole)"

@@ -11,11 +11,11 @@ import torch
 from hand_made import random_mpi
 from random_fields import random_rays
 
-from mmpi_ns.export.files import BakedScene, Pose
-from mmpi_ns.rendering.baked import BakedWindow
-from mmpi_ns.scene.baked import BakedMpis, Codes, Shader, columns_from, neighbours, take_borders, tiles_of
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window
+from mmpi_show.files import BakedScene, Pose
+from mmpi_show.scene import BakedMpis, Codes, Shader, columns_from, neighbours, take_borders, tiles_of
+from mmpi_show.windows import BakedWindow
 
 
 def random_window(num_mpis=2, seed=0, planes=40, channels=5, stored=0.5, density=(0, 255), shares=(0.6, 1.0)):

@@ -18,10 +18,10 @@ from tiny_scene import write_scene
 from training_runs import ready, trainer_config, write_plan, write_windows
 
 import mmpi_ns
-from mmpi_ns.capture.rays import image_rays
-from mmpi_ns.export.files import HEADER, BakedScene, read_baked, write_baked
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.ops.baked.reader import camera_rays
 from mmpi_ns.utils.errors import InputError
+from mmpi_show.files import HEADER, BakedScene, read_baked, write_baked
 
 ROOT = Path(__file__).parents[1]
 

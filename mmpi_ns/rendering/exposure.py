@@ -11,12 +11,12 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from mmpi_ns.capture.datamanager import MMPIDataManager
-from mmpi_ns.capture.new_views import image_and_mask
-from mmpi_ns.capture.observe import posed_images
-from mmpi_ns.capture.photometry import MAX_ANGLE, NEIGHBOURS, SAMPLES, ExposedView, Gains, exposure_of_view
+from mmpi_ns.data.datamanager import MMPIDataManager
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError
+from mmpi_priors.new_views import image_and_mask
+from mmpi_priors.observe import posed_images
+from mmpi_priors.photometry import MAX_ANGLE, NEIGHBOURS, SAMPLES, ExposedView, Gains, exposure_of_view
 
 OPAQUE = 0.9
 """Accumulation from which a pixel's depth is that of a surface."""

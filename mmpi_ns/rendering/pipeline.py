@@ -14,7 +14,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch import Tensor
 
-from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.details import moved_cameras
 from mmpi_ns.rendering.exposure import exposure_of_image
 from mmpi_ns.utils.errors import InputError, say

@@ -11,7 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
-from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH
+from mmpi_ns.data.ray_sources import KEYPOINT_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.field.tables import Lookup

@@ -45,7 +45,7 @@ class PlanCommand:
 
     def main(self) -> None:
         # Slow imports, which --help does not need.
-        from mmpi_ns.capture.datamanager import load_observations
+        from mmpi_ns.data.datamanager import load_observations
         from mmpi_ns.placement.split import most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import make_writable

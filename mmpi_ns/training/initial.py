@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.capture.ray_sources import PIXEL_DEPTH, RaySources
+from mmpi_ns.data.ray_sources import PIXEL_DEPTH, RaySources
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.geometry import inverse_distance, plane_hits, sample_disparity

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.capture.ray_sources import EXPOSURE, KEYPOINT_DEPTH, PIXEL_DEPTH
+from mmpi_ns.data.ray_sources import EXPOSURE, KEYPOINT_DEPTH, PIXEL_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.depth_sums import DepthSums, depth_sums
 from mmpi_ns.rendering.rendered import RenderedRays

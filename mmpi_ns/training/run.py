@@ -22,8 +22,8 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from mmpi_ns.capture.datamanager import MMPIDataManager
-from mmpi_ns.capture.ray_sources import OWN_PIXEL
+from mmpi_ns.data.datamanager import MMPIDataManager
+from mmpi_ns.data.ray_sources import OWN_PIXEL
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.placement.split import cameras_of
 from mmpi_ns.rendering.window_store import WindowStore

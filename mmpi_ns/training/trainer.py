@@ -16,9 +16,8 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 
-from mmpi_ns.capture.checks import LOAD_RUNS
-from mmpi_ns.capture.datamanager import MMPIDataManager
-from mmpi_ns.capture.new_views import image_and_mask
+from mmpi_ns.data.checks import LOAD_RUNS
+from mmpi_ns.data.datamanager import MMPIDataManager
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
 from mmpi_ns.rendering.rendered import BACKGROUNDS
@@ -45,6 +44,7 @@ from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import command, discard, enter_command, signals_go_to, values_of
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
+from mmpi_priors.new_views import image_and_mask
 
 
 @dataclass

@@ -12,7 +12,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 from trainings import Progress
 
-from mmpi_ns.capture.dataset import parser_points
+from mmpi_ns.data.dataset import parser_points
 from mmpi_ns.ops import dispatch
 
 

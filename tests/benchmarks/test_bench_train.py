@@ -25,8 +25,8 @@ from train import Train
 from train_report import headline, markdown
 
 from mmpi_ns.bench.trainers import Steps
-from mmpi_ns.capture import datamanager
-from mmpi_ns.capture.known_depth import KnownDepth, packed
+from mmpi_ns.data import datamanager
+from mmpi_priors.known_depth import KnownDepth, packed
 
 
 def in_this_process(request, threads):

@@ -21,8 +21,8 @@ from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, name_of, write_scene
 from training_runs import datamanager, ready, trainer_config, write_plan
 
-from mmpi_ns.capture.observe import ENOUGH_KEYPOINTS
 from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_priors.observe import ENOUGH_KEYPOINTS
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from time import sleep
 import numpy as np
 from filelock import FileLock
 
-from mmpi_ns.capture import cache
-from mmpi_ns.capture.cache import digest, held, remembered
+from mmpi_priors import cache
+from mmpi_priors.cache import digest, held, remembered
 
 
 def counting(calls, delay=0.0):

@@ -9,7 +9,7 @@ import pytest
 from tiny_scene import wall_points, write_scene
 from training_runs import datamanager
 
-from mmpi_ns.capture.datamanager import OBSERVATIONS
+from mmpi_ns.data.datamanager import OBSERVATIONS
 
 
 def scene_with_points(folder, points):

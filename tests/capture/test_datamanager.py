@@ -15,15 +15,16 @@ from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, in_capture_frame, plan_of
 
-from mmpi_ns.capture import known_depth, rays
-from mmpi_ns.capture.checks import say_once
-from mmpi_ns.capture.known_depth import UNKNOWN, KnownDepth
-from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
-from mmpi_ns.capture.rays import CameraRays, image_rays
-from mmpi_ns.capture.sfm import MIN_TRACK
+from mmpi_ns.data import rays
+from mmpi_ns.data.checks import say_once
+from mmpi_ns.data.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
+from mmpi_ns.data.rays import CameraRays, image_rays
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError
+from mmpi_priors import known_depth
+from mmpi_priors.known_depth import UNKNOWN, KnownDepth
+from mmpi_priors.sfm import MIN_TRACK
 
 TRACKED = sum(project(i, wall_points())[1].astype(int) for i in range(8)) >= MIN_TRACK
 

@@ -10,13 +10,13 @@ from PIL import Image
 from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, write_scene
 from training_runs import datamanager, in_capture_frame
 
-from mmpi_ns.capture.datamanager import GAINS
-from mmpi_ns.capture.observe import posed_images
-from mmpi_ns.capture.photometry import ExposedView, exposure_of_view
-from mmpi_ns.capture.ray_sources import EXPOSURE
+from mmpi_ns.data.datamanager import GAINS
+from mmpi_ns.data.ray_sources import EXPOSURE
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.metrics import ImageMetrics, color_corrected, psnr
 from mmpi_ns.training.losses import photometric
+from mmpi_priors.observe import posed_images
+from mmpi_priors.photometry import ExposedView, exposure_of_view
 
 FACTORS = np.random.default_rng(3).uniform(0.55, 1.0, (8, 3))
 
@@ -73,7 +73,7 @@ def test_images_of_one_exposure_are_drawn_as_they_are(scene):
 
 
 def test_exposures_that_exif_notes_as_equal_are_not_searched(exposed, monkeypatch, capsys):
-    monkeypatch.setattr("mmpi_ns.capture.datamanager.light_of", lambda file: 0.01)
+    monkeypatch.setattr("mmpi_ns.data.datamanager.light_of", lambda file: 0.01)
     assert datamanager(exposed).gains is None
     assert "EXIF notes the same" in capsys.readouterr().out
 

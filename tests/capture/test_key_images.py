@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mmpi_ns.capture import moving
-from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving import WALKERS, find_moving, key_images
-from mmpi_ns.capture.moving_evidence import Shot
-from mmpi_ns.capture.people import NOBODY
-from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import View
+from mmpi_priors import moving
+from mmpi_priors.dense import Depth
+from mmpi_priors.moving import WALKERS, find_moving, key_images
+from mmpi_priors.moving_evidence import Shot
+from mmpi_priors.people import NOBODY
+from mmpi_priors.tracks import PosedImages
+from mmpi_priors.views import View
 
 
 def aside(*places):

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.capture import known_depth
-from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.known_depth import (
+from mmpi_ns.placement.observations import Observations
+from mmpi_priors import known_depth
+from mmpi_priors.dense import Depth
+from mmpi_priors.known_depth import (
     POINT_ERROR,
     SENSOR_ERROR,
     UNKNOWN,
@@ -23,9 +24,8 @@ from mmpi_ns.capture.known_depth import (
     with_points,
     with_sensor,
 )
-from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import View
-from mmpi_ns.placement.observations import Observations
+from mmpi_priors.tracks import PosedImages
+from mmpi_priors.views import View
 
 F32 = np.float32
 STEP = 3.5e-4

@@ -12,10 +12,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.ray_generators import RayGenerator
 
-from mmpi_ns.capture import known_depth
-from mmpi_ns.capture.known_depth import KnownDepth, packed, with_continued
-from mmpi_ns.capture.lone_depth import LEAST_ERROR, MOST_ERROR, continued, is_lone
-from mmpi_ns.capture.tracks import PosedImages
+from mmpi_priors import known_depth
+from mmpi_priors.known_depth import KnownDepth, packed, with_continued
+from mmpi_priors.lone_depth import LEAST_ERROR, MOST_ERROR, continued, is_lone
+from mmpi_priors.tracks import PosedImages
 
 F32 = np.float32
 WIDTH, HEIGHT, FOCAL = 96, 64, 60.0

@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.capture import moving, moving_carry, moving_objects
-from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving import reaches_side
-from mmpi_ns.capture.moving_carry import Carried, carried, whole_objects
-from mmpi_ns.capture.moving_evidence import Neighbour, Shot
-from mmpi_ns.capture.moving_objects import followed
-from mmpi_ns.capture.people import NOBODY
-from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import View
+from mmpi_priors import moving, moving_carry, moving_objects
+from mmpi_priors.dense import Depth
+from mmpi_priors.moving import reaches_side
+from mmpi_priors.moving_carry import Carried, carried, whole_objects
+from mmpi_priors.moving_evidence import Neighbour, Shot
+from mmpi_priors.moving_objects import followed
+from mmpi_priors.people import NOBODY
+from mmpi_priors.tracks import PosedImages
+from mmpi_priors.views import View
 
 SIZE, FOCAL, HEIGHT = (160, 240), 200.0, 1.5
 PINHOLE = np.array([FOCAL, FOCAL, 120.0, 60.0])

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving_doubt import MANY, SUNK, doubt_of, share_sunk
-from mmpi_ns.capture.moving_evidence import Shot
-from mmpi_ns.capture.views import View
+from mmpi_priors.dense import Depth
+from mmpi_priors.moving_doubt import MANY, SUNK, doubt_of, share_sunk
+from mmpi_priors.moving_evidence import Shot
+from mmpi_priors.views import View
 
 UP = np.array([0.0, 0.0, 1.0])
 FACING = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from training_runs import datamanager
 
-from mmpi_ns.capture import moving
-from mmpi_ns.capture.datamanager import load_observations
-from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving import gain_of, in_image
-from mmpi_ns.capture.moving_carry import Carried
-from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
-from mmpi_ns.capture.moving_objects import (
+from mmpi_ns.data.datamanager import load_observations
+from mmpi_priors import moving
+from mmpi_priors.dense import Depth
+from mmpi_priors.moving import gain_of, in_image
+from mmpi_priors.moving_carry import Carried
+from mmpi_priors.moving_evidence import Evidence, Neighbour, Shot, evidence, ground_of, nearest_known, splat
+from mmpi_priors.moving_objects import (
     LEAST_LEVELS,
     REACH,
     STEPS,
@@ -28,8 +28,8 @@ from mmpi_ns.capture.moving_objects import (
     seeds,
     unexplained,
 )
-from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Parallax, View, camera_matrix
+from mmpi_priors.tracks import PosedImages
+from mmpi_priors.views import Parallax, View, camera_matrix
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 from mmpi_scene.movers import MOVER, with_movers

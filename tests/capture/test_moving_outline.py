@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from test_moving_masks import SIZE, a_shot, neighbours, textured
 
-from mmpi_ns.capture.moving_evidence import least_unlike
-from mmpi_ns.capture.moving_objects import touching
-from mmpi_ns.capture.moving_outline import AROUND, OVER, outlined
+from mmpi_priors.moving_evidence import least_unlike
+from mmpi_priors.moving_objects import touching
+from mmpi_priors.moving_outline import AROUND, OVER, outlined
 
 EVERYWHERE = np.s_[0 : SIZE[0], 0 : SIZE[1]]
 SQUARE, HALO = np.s_[22:38, 30:50], np.s_[16:44, 24:56]

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving_evidence import Shot
-from mmpi_ns.capture.moving_follow import upright_objects
-from mmpi_ns.capture.views import View
+from mmpi_priors.dense import Depth
+from mmpi_priors.moving_evidence import Shot
+from mmpi_priors.moving_follow import upright_objects
+from mmpi_priors.views import View
 
 SIZE, FOCAL, HEIGHT, STEP = (120, 200), 200.0, 1.5, 1.0
 """Rows and columns, pixels, metres of the cameras over the ground and between them."""

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving_evidence import Neighbour, Shot
-from mmpi_ns.capture.moving_sweep import floats, is_straight, solid, sweep
-from mmpi_ns.capture.views import View
+from mmpi_priors.dense import Depth
+from mmpi_priors.moving_evidence import Neighbour, Shot
+from mmpi_priors.moving_sweep import floats, is_straight, solid, sweep
+from mmpi_priors.views import View
 
 SIZE, FOCAL, HEIGHT = (160, 240), 200.0, 1.5
 PINHOLE = np.array([FOCAL, FOCAL, 120.0, 60.0])

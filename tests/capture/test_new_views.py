@@ -10,11 +10,11 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from tiny_scene import FOCAL, HEIGHT, TRAIN, WALL, WIDTH, color_of, image_of, on_wall, pixel_rays, pose_of
 
-from mmpi_ns.capture import new_views
-from mmpi_ns.capture.known_depth import KnownDepth, packed
-from mmpi_ns.capture.new_views import find_shared_points
-from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import project
+from mmpi_priors import new_views
+from mmpi_priors.known_depth import KnownDepth, packed
+from mmpi_priors.new_views import find_shared_points
+from mmpi_priors.tracks import PosedImages
+from mmpi_priors.views import project
 
 POSES = np.stack([pose_of(i)[:3] for i in TRAIN])
 

@@ -13,9 +13,10 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 from tiny_scene import write_colmap
 
-from mmpi_ns.capture import observe as mmpi_observations
-from mmpi_ns.capture.checks import say_once
-from mmpi_ns.capture.observe import (
+from mmpi_ns.data.checks import say_once
+from mmpi_ns.placement.observations import Observations
+from mmpi_priors import observe as mmpi_observations
+from mmpi_priors.observe import (
     ENOUGH_KEYPOINTS,
     drop_masked,
     observe,
@@ -25,9 +26,8 @@ from mmpi_ns.capture.observe import (
     with_surfaces,
     with_tracks,
 )
-from mmpi_ns.capture.sfm import SfmModel, find_sfm_model, numbers_in_model
-from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.placement.observations import Observations
+from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
+from mmpi_priors.tracks import PosedImages
 
 SIZES = np.array([[40.0, 20.0], [80.0, 60.0]])
 

@@ -16,9 +16,9 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from mmpi_ns.capture.dataset import LocalOrigin, take_local_origins
-from mmpi_ns.capture.tracks import PosedImages, at_full_size, original_of
-from mmpi_ns.prepare.export import downscale
+from mmpi_ns.data.dataset import LocalOrigin, take_local_origins
+from mmpi_prepare.export import downscale
+from mmpi_priors.tracks import PosedImages, at_full_size, original_of
 
 
 def write(path: Path, width: int, height: int) -> Path:

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.capture import moving
-from mmpi_ns.capture.checks import say_once
-from mmpi_ns.capture.dense import Depth
-from mmpi_ns.capture.moving_evidence import Evidence, Shot
-from mmpi_ns.capture.moving_objects import SURE, grown
-from mmpi_ns.capture.people import horizon_of, people_in
-from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.upright import upright
-from mmpi_ns.capture.views import load_view, straightened_color
+from mmpi_ns.data.checks import say_once
+from mmpi_priors import moving
+from mmpi_priors.dense import Depth
+from mmpi_priors.moving_evidence import Evidence, Shot
+from mmpi_priors.moving_objects import SURE, grown
+from mmpi_priors.people import horizon_of, people_in
+from mmpi_priors.tracks import PosedImages
+from mmpi_priors.upright import upright
+from mmpi_priors.views import load_view, straightened_color
 
 WIDTH, HEIGHT, TALL = 640, 480, 120
 UP = np.array([0.0, 1.0, 0.0])

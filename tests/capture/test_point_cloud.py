@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from mmpi_ns.capture.dataset import GRAY, parser_points
+from mmpi_ns.data.dataset import GRAY, parser_points
 
 
 def test_points_without_colours_are_gray_and_keep_all_their_digits(tmp_path):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from value_noise import noise
 
-from mmpi_ns.capture import dense
-from mmpi_ns.capture.dense import ROUNDS, Depth, confirmed, matched
-from mmpi_ns.capture.patches import Surfaces, search_surfaces
-from mmpi_ns.capture.views import View
+from mmpi_priors import dense
+from mmpi_priors.dense import ROUNDS, Depth, confirmed, matched
+from mmpi_priors.patches import Surfaces, search_surfaces
+from mmpi_priors.views import View
 
 WIDTH, HEIGHT, FOCAL, STEP = 240, 180, 170.0, 1.3
 WALLS = ((0, -1.0), (0, 1.2), (1, -0.8), (1, 1.5), (2, -9.0))

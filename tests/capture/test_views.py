@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from test_tracks import HEIGHT, LENS, POSES, WIDTH, scene_of
 
-from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Parallax, View, load_view
+from mmpi_priors.tracks import PosedImages
+from mmpi_priors.views import Parallax, View, load_view
 
 
 @pytest.mark.parametrize("size", [(1000, 500), (500, 1000)])

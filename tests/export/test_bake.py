@@ -15,18 +15,18 @@ from nerfstudio.utils.eval_utils import eval_setup
 from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
-from mmpi_ns.capture.rays import image_rays
-from mmpi_ns.export import bake as bake_module
-from mmpi_ns.export.bake import bake_run, compare
-from mmpi_ns.export.files import read_baked, write_baked
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.ops import dispatch
-from mmpi_ns.rendering import baked as baking
 from mmpi_ns.rendering.metrics import psnr
 from mmpi_ns.rendering.rendered import bounded, shown_outputs
-from mmpi_ns.scene.baked import brick_numbers
 from mmpi_ns.scene.plan import CubePlan
-from mmpi_ns.scripts import export
+from mmpi_show import __main__ as export
+from mmpi_show import bake as bake_module
+from mmpi_show import windows as baking
+from mmpi_show.bake import bake_run, compare
+from mmpi_show.files import read_baked, write_baked
+from mmpi_show.scene import brick_numbers
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def test_training_on_forgets_what_was_baked(trainer):
 def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
     """What seen bricks show is what all show, and the file gives the same images."""
     model = filled(trainer)
-    monkeypatch.setattr("mmpi_ns.export.bake.load_model", lambda *_: trainer.pipeline)
+    monkeypatch.setattr("mmpi_show.bake.load_model", lambda *_: trainer.pipeline)
     scene = export.Bake(tmp_path / "config.yml", compare=2).bake()
     whole, told = model.baked(model.field), capsys.readouterr().out
     kept = scene.windows[0][1]

@@ -10,11 +10,11 @@ import pytest
 import torch
 from random_bricks import random_window, scene_of
 
-from mmpi_ns.export.bake import smoothed
-from mmpi_ns.export.codes import coarse_differences, smoothed_codes
-from mmpi_ns.export.files import write_baked
 from mmpi_ns.ops.baked import reader
-from mmpi_ns.scene.baked import CELLS, brick_numbers, most_of_copies, neighbours, take_borders
+from mmpi_show.bake import smoothed
+from mmpi_show.codes import coarse_differences, smoothed_codes
+from mmpi_show.files import write_baked
+from mmpi_show.scene import CELLS, brick_numbers, most_of_copies, neighbours, take_borders
 
 
 def rough_window():

@@ -11,11 +11,11 @@ import pytest
 import torch
 from random_bricks import random_window, rays_into, scene_of
 
-from mmpi_ns.export import files
-from mmpi_ns.export.details import StoredView
-from mmpi_ns.export.files import HEADER, read_baked, write_baked
 from mmpi_ns.ops.baked import reader, show_baked
 from mmpi_ns.ops.march import Rays
+from mmpi_show import files
+from mmpi_show.details import StoredView
+from mmpi_show.files import HEADER, read_baked, write_baked
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def test_damage_is_one_sentence(folder):
 
 def test_a_full_disk_leaves_no_header(folder, monkeypatch):
     """Writing over an export that fails half way leaves nothing that looks whole."""
-    import mmpi_ns.export.files as files
+    import mmpi_show.files as files
 
     monkeypatch.setattr(files, "write_atomically", full_disk)
     with pytest.raises(OSError, match="No space left"):

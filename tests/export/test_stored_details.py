@@ -11,11 +11,11 @@ from baked_details import detailed_scene, details_for, opaque_window, with_detai
 from nerfstudio.cameras.cameras import Cameras
 from random_bricks import scene_of
 
-from mmpi_ns.capture.rays import image_rays
-from mmpi_ns.export import details as stored
-from mmpi_ns.export.details import restored_view, stored_view
-from mmpi_ns.export.files import HEADER, read_baked, write_baked
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.details import DetailView
+from mmpi_show import details as stored
+from mmpi_show.details import restored_view, stored_view
+from mmpi_show.files import HEADER, read_baked, write_baked
 
 CPU = torch.device("cpu")
 

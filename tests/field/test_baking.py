@@ -12,9 +12,9 @@ from hand_made import make_mpi
 from random_fields import _places, _table, fill, random_field
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.rendering.baked import bake_shares
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
+from mmpi_show.windows import bake_shares
 
 
 def oracle_share(field, k, z, y, x):

@@ -16,7 +16,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from tiny_scene import write_scene
 from training_runs import compared, differences, load, ready, trainer_config, write_plan, write_windows
 
-from mmpi_ns.capture.ray_sources import OWN_PIXEL
+from mmpi_ns.data.ray_sources import OWN_PIXEL
 from mmpi_ns.training.run import move_rays
 from mmpi_ns.utils.errors import InputError
 

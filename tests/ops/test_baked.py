@@ -9,11 +9,11 @@ import pytest
 import torch
 from random_bricks import random_window, rays_into, scene_of
 
-from mmpi_ns.export.files import write_baked
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.baked import reader
 from mmpi_ns.ops.march import Rays
-from mmpi_ns.scene.baked import SIDE, Shader, brick_numbers, columns_from
+from mmpi_show.files import write_baked
+from mmpi_show.scene import SIDE, Shader, brick_numbers, columns_from
 
 FORMS = ("reference", "cpu")
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 
-from mmpi_ns.export.web import PAGE, write_page
 from mmpi_ns.ops import details, ends
 from mmpi_ns.rendering.details import MAX_ANGLE
 from mmpi_ns.scene.geometry import FACING_EPS
+from mmpi_show.web import PAGE, write_page
 
 NUMBERS = dict(re.findall(r"const float (\w+) = (\S+);", ends.TEXT))
 
@@ -19,7 +19,7 @@ def test_python_reads_the_numbers_of_the_header():
 
 
 def test_the_pages_shader_has_the_header_and_no_numbers_of_its_own(tmp_path, monkeypatch):
-    monkeypatch.setattr("mmpi_ns.export.web.read_header", lambda folder: {})
+    monkeypatch.setattr("mmpi_show.web.read_header", lambda folder: {})
     page = write_page(tmp_path).read_text(encoding="utf-8")
     assert page.count(ends.TEXT) == 1
     shader = (PAGE / "march.glsl").read_text(encoding="utf-8")
@@ -29,7 +29,7 @@ def test_the_pages_shader_has_the_header_and_no_numbers_of_its_own(tmp_path, mon
 
 def test_weights_of_details_stand_in_one_header_too(tmp_path, monkeypatch):
     """Which C++, Python and the page's shader read."""
-    monkeypatch.setattr("mmpi_ns.export.web.read_header", lambda folder: {})
+    monkeypatch.setattr("mmpi_show.web.read_header", lambda folder: {})
     page = write_page(tmp_path).read_text(encoding="utf-8")
     numbers = dict(re.findall(r"const float (\w+) = (\S+);", details.TEXT))
     assert page.count(details.TEXT) == 1 and f"const MAX_ANGLE = {MAX_ANGLE};" in page

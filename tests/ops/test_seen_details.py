@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.details import FADE, SAME_DEPTH, SAME_PIXELS, TURN, project, seen_details
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from mmpi_ns.capture.rays import lens_directions
+from mmpi_ns.data.rays import lens_directions
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.utils.errors import InputError

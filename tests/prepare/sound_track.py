@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 
-from mmpi_ns.prepare.evidence import Pairs, Witness, scale_changes
+from mmpi_prepare.evidence import Pairs, Witness, scale_changes
 
 FOCAL, WIDTH, HEIGHT = 360.0, 620, 188
 LIMIT = 3.0

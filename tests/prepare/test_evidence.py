@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from sound_track import FOCAL, drive, observed, project, scattered, triangulated, witness_with
 
-from mmpi_ns.prepare.evidence import (
+from mmpi_prepare.evidence import (
     Pairs,
     Witness,
     agreement,
@@ -19,7 +19,7 @@ from mmpi_ns.prepare.evidence import (
     strides,
     turns_explain,
 )
-from mmpi_ns.prepare.verdict import best_first, judge_alone, judge_together
+from mmpi_prepare.verdict import best_first, judge_alone, judge_together
 
 POSES = drive()
 POINTS = scattered(POSES)

@@ -16,11 +16,11 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.prepare import images
-from mmpi_ns.prepare.checks import Finding, by_kind
-from mmpi_ns.prepare.pipeline import WORK, only_one, prepare
-from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.utils.errors import InputError, progress
+from mmpi_prepare import images
+from mmpi_prepare.checks import Finding, by_kind
+from mmpi_prepare.pipeline import WORK, only_one, prepare
+from mmpi_prepare.settings import Settings
 
 NAN = float("nan")
 
@@ -157,7 +157,7 @@ def test_the_last_line_is_a_command_to_copy(tmp_path, capsys):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_with_one_sentence(number, tmp_path):
     corridor.write_images(tmp_path / "frames", 14)
-    command = [sys.executable, "-m", "mmpi_ns.scripts.prepare", str(tmp_path / "frames"), str(tmp_path / "scene")]
+    command = [sys.executable, "-m", "mmpi_prepare.__main__", str(tmp_path / "frames"), str(tmp_path / "scene")]
     run = subprocess.Popen([*command, "--threads", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while not (tmp_path / "scene" / WORK / "features").is_dir() and run.poll() is None:
         time.sleep(0.05)
@@ -172,7 +172,7 @@ def test_a_signal_ends_it_with_one_sentence(number, tmp_path):
 def test_a_signal_ends_the_command_while_the_interpreters_lock_is_held(tmp_path):
     """As COLMAP's bundle adjustment holds it."""
     program = (
-        "from mmpi_ns.scripts.prepare import end_at_once_on_signals; import ctypes; end_at_once_on_signals();"
+        "from mmpi_prepare.__main__ import end_at_once_on_signals; import ctypes; end_at_once_on_signals();"
         "print('at work', flush=True); ctypes.PyDLL(None).sleep(60)"
     )
     run = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -187,7 +187,7 @@ def test_a_signal_ends_the_command_while_the_interpreters_lock_is_held(tmp_path)
 )
 def test_the_exit_status_is_that_of_the_work(ends, status, words):
     program = (
-        f"from mmpi_ns.scripts.prepare import end_at_once_on_signals; import os, sys; end_at_once_on_signals(); {ends}"
+        f"from mmpi_prepare.__main__ import end_at_once_on_signals; import os, sys; end_at_once_on_signals(); {ends}"
     )
     ended = subprocess.run([sys.executable, "-c", program], check=False, stderr=subprocess.PIPE, text=True)
     assert ended.returncode == status and (words in ended.stderr if words else not ended.stderr)

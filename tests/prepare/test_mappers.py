@@ -12,14 +12,14 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.capture.sfm import count_features
-from mmpi_ns.prepare import adjustment, features, mapping
-from mmpi_ns.prepare.adjustment import camera_poses, similarity_between, with_all_points, with_fewer_points
-from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.mapping import Task, map_and_judge
-from mmpi_ns.prepare.pipeline import WORK, prepare
-from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.utils.errors import InputError
+from mmpi_prepare import adjustment, features, mapping
+from mmpi_prepare.adjustment import camera_poses, similarity_between, with_all_points, with_fewer_points
+from mmpi_prepare.images import Photo
+from mmpi_prepare.mapping import Task, map_and_judge
+from mmpi_prepare.pipeline import WORK, prepare
+from mmpi_prepare.settings import Settings
+from mmpi_priors.sfm import count_features
 
 COUNT = 12
 

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from test_prepare_parts import model_of
 
-from mmpi_ns.prepare.adjustment import open_focals, with_focals
+from mmpi_prepare.adjustment import open_focals, with_focals
 
 TRUE, LENS = 300.0, {"model": "SIMPLE_RADIAL", "width": 200, "height": 160, "camera_id": 1}
 

@@ -13,12 +13,12 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 from reprojection import median_reprojection_error
 
-from mmpi_ns.capture.observe import read_observations
-from mmpi_ns.capture.sfm import find_sfm_model
-from mmpi_ns.prepare import features, mapping, pipeline
-from mmpi_ns.prepare.adjustment import camera_poses, similarity_between
-from mmpi_ns.prepare.pipeline import WORK, prepare
-from mmpi_ns.prepare.settings import Settings
+from mmpi_prepare import features, mapping, pipeline
+from mmpi_prepare.adjustment import camera_poses, similarity_between
+from mmpi_prepare.pipeline import WORK, prepare
+from mmpi_prepare.settings import Settings
+from mmpi_priors.observe import read_observations
+from mmpi_priors.sfm import find_sfm_model
 
 COUNT = 12
 

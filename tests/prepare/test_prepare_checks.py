@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import corridor
 
-from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.settings import Settings
+from mmpi_prepare.pipeline import prepare
+from mmpi_prepare.settings import Settings
 
 
 def report_of(frames, scene, **options):

@@ -12,10 +12,11 @@ import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
-from mmpi_ns.capture.exif import light_of
-from mmpi_ns.prepare import checks, export, features
-from mmpi_ns.prepare.checks import exposure_in_words
-from mmpi_ns.prepare.images import (
+from mmpi_ns.data.exif import light_of
+from mmpi_ns.utils.errors import InputError
+from mmpi_prepare import checks, export, features
+from mmpi_prepare.checks import exposure_in_words
+from mmpi_prepare.images import (
     Photo,
     choose_frames,
     find_images,
@@ -25,10 +26,9 @@ from mmpi_ns.prepare.images import (
     select_frames,
     sharpness,
 )
-from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
-from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.utils.errors import InputError
+from mmpi_prepare.pipeline import prepare
+from mmpi_prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
+from mmpi_prepare.settings import Settings
 
 
 def save(path, size=(40, 30), value=100, **more):

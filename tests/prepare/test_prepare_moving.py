@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.settings import Settings
+from mmpi_prepare.pipeline import prepare
+from mmpi_prepare.settings import Settings
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 from mmpi_scene.movers import MOVER, with_movers

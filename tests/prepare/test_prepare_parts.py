@@ -14,12 +14,12 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.capture.sfm import rigid3d
-from mmpi_ns.prepare import export, features, mapping
-from mmpi_ns.prepare.adjustment import adjust, choose_frame, is_bent, polish, quality, similarity_between
-from mmpi_ns.prepare.images import Photo, choose_frames, median_motion
-from mmpi_ns.prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
 from mmpi_ns.utils.errors import InputError
+from mmpi_prepare import export, features, mapping
+from mmpi_prepare.adjustment import adjust, choose_frame, is_bent, polish, quality, similarity_between
+from mmpi_prepare.images import Photo, choose_frames, median_motion
+from mmpi_prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
+from mmpi_priors.sfm import rigid3d
 
 
 def model_of(poses, *cameras):
@@ -307,7 +307,7 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
         simple = polish(model, 1, lens=True, full_lens=False, principal_point=False)
         assert [c.model.name for c in simple.cameras.values()] == ["SIMPLE_RADIAL"]
         assert "off square" not in capsys.readouterr().out
-        monkeypatch.setattr("mmpi_ns.prepare.adjustment.SQUARE", 1e-4)
+        monkeypatch.setattr("mmpi_prepare.adjustment.SQUARE", 1e-4)
         square = polish(model, 1, lens=True, full_lens=True, principal_point=False)
         assert [c.model.name for c in square.cameras.values()] == ["SIMPLE_RADIAL"]
         assert "not kept, as pixels would be" in capsys.readouterr().out
@@ -315,5 +315,5 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
 
 def test_nothing_of_prepare_waits_for_torch_before_what_moves_is_looked_for():
     """Importing torch takes seconds and half a gigabyte."""
-    code = "import sys, mmpi_ns.prepare.pipeline; sys.exit('torch' in sys.modules)"
+    code = "import sys, mmpi_prepare.pipeline; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

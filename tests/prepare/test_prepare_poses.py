@@ -9,11 +9,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.poses import opencv_intrinsics, read_poses
-from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.utils.errors import InputError
+from mmpi_prepare.images import Photo
+from mmpi_prepare.pipeline import prepare
+from mmpi_prepare.poses import opencv_intrinsics, read_poses
+from mmpi_prepare.settings import Settings
 
 COUNT = 8
 GIVEN = corridor.poses(COUNT)

@@ -13,7 +13,7 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 
-from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH
 from mmpi_ns.rendering.details import (

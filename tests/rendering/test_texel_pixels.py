@@ -8,7 +8,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 
-from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.rendered import winners
 from mmpi_ns.scene.geometry import Frames
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan

@@ -9,7 +9,7 @@ from hand_made import make_mpi, rotation
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from training_runs import datamanager, plan_of
 
-from mmpi_ns.capture.datamanager import TRAINING_VIEWS
+from mmpi_ns.data.datamanager import TRAINING_VIEWS
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.scene import visible_tiles
 from mmpi_ns.scene.geometry import Frames, plane_hits, sample_disparity

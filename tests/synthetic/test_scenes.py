@@ -12,7 +12,7 @@ from PIL import Image
 from procedural import keypoint_errors
 from reprojection import median_reprojection_error
 
-from mmpi_ns.capture.sfm import find_sfm_model
+from mmpi_priors.sfm import find_sfm_model
 from mmpi_scene import SCENES, Cameras, Scene, make_scene, render, sfm_points, write_dataset
 from mmpi_scene.__main__ import SceneCommand
 from mmpi_scene.dataset import PARTS
@@ -300,7 +300,7 @@ def test_nerfstudio_and_the_data_manager_read_what_was_written(dataset, street):
     from nerfstudio.data.datasets.base_dataset import InputDataset
     from training_runs import datamanager
 
-    from mmpi_ns.capture.observe import read_observations
+    from mmpi_priors.observe import read_observations
 
     manager = datamanager(dataset)
     outputs = manager.train_dataparser_outputs

@@ -105,7 +105,7 @@ def test_reading_a_colmap_model_leaves_the_answer_to_sigterm_as_it_was(scene):
         "import os, signal, sys\n"
         "from pathlib import Path\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit('ours'))\n"
-        "from mmpi_ns.capture.sfm import find_sfm_model\n"
+        "from mmpi_priors.sfm import find_sfm_model\n"
         "assert find_sfm_model(Path(sys.argv[1])) is not None\n"
         "os.kill(os.getpid(), signal.SIGTERM)\n"
     )

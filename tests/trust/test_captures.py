@@ -308,8 +308,8 @@ def test_a_folder_that_is_no_scene_is_one_sentence(tmp_path):
 def test_cameras_of_other_parsers_are_named(whole_scene):
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-    from mmpi_ns.capture.observe import read_observations
     from mmpi_ns.utils.errors import InputError
+    from mmpi_priors.observe import read_observations
 
     parser = NerfstudioDataParserConfig(data=whole_scene, downscale_factor=1).setup()
     outputs = parser.get_dataparser_outputs("train")

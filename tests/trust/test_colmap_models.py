@@ -17,7 +17,7 @@ from training_runs import datamanager
 @pytest.fixture
 def model(data):
     """The scene's COLMAP model in the binary format."""
-    from mmpi_ns.capture.sfm import load_pycolmap
+    from mmpi_priors.sfm import load_pycolmap
 
     folder = data / "colmap/sparse/0"
     load_pycolmap().Reconstruction(str(folder)).write_binary(str(folder))
@@ -134,7 +134,7 @@ def test_a_run_of_the_colmap_parser_can_be_rendered_without_its_images(data):
 
 
 def end_by(number):
-    from mmpi_ns.capture.sfm import load_pycolmap
+    from mmpi_priors.sfm import load_pycolmap
 
     load_pycolmap()
     os.kill(os.getpid(), number)

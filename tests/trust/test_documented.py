@@ -23,7 +23,11 @@ def template(node):
 
 def parsed(but=""):
     """The modules of both packages, but for those of one folder."""
-    paths = [path for name in ("mmpi_ns", "mmpi_scene") for path in (ROOT / name).rglob("*.py")]
+    paths = [
+        path
+        for name in ("mmpi_ns", "mmpi_priors", "mmpi_prepare", "mmpi_show", "mmpi_scene")
+        for path in (ROOT / name).rglob("*.py")
+    ]
     return [ast.parse(path.read_text(encoding="utf-8")) for path in paths if path.parent.name != but]
 
 

@@ -80,8 +80,8 @@ def use_capture(folder):
     """Reads a transforms.json as ns-train does, up to the cameras that placement is given."""
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-    from mmpi_ns.capture.checks import check_transforms
-    from mmpi_ns.capture.observe import read_observations
+    from mmpi_ns.data.checks import check_transforms
+    from mmpi_priors.observe import read_observations
 
     def use(text):
         (folder / "transforms.json").write_text(text)

@@ -22,7 +22,7 @@ def move_poses(meta):
 
 def move(folder, sfm=True):
     """Adds the offset to all poses and to the COLMAP model, or to its applied_transform."""
-    from mmpi_ns.capture.sfm import load_pycolmap
+    from mmpi_priors.sfm import load_pycolmap
 
     path = folder / "transforms.json"
     meta = json.loads(path.read_text())

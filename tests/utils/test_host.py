@@ -24,16 +24,13 @@ from mmpi_ns.utils import host
 from mmpi_ns.utils.errors import InputError
 
 ROOT = Path(mmpi_ns.__file__).parent
-WINGS = (
-    *("utils", "scene", "ops", "placement", "capture", "field", "rendering", "training", "export"),
-    *("prepare", "bench"),
-)
-FOLDERS = (*(ROOT / wing for wing in WINGS), ROOT.parent / "mmpi_scene")
-FILES = [*ROOT.glob("*.py"), *(path for folder in FOLDERS for path in folder.rglob("*.py"))]
+COMPANIONS = ("mmpi_priors", "mmpi_prepare", "mmpi_show", "mmpi_scene")
+FOLDERS = (ROOT, *(ROOT.parent / name for name in COMPANIONS))
+FILES = [path for folder in FOLDERS for path in folder.rglob("*.py")]
 HOST_CALLS = {"signal.signal", "sys.settrace", "warnings.filterwarnings", "warnings.simplefilter", "setattr"}
 LISTED = {
-    ("mmpi_ns/capture/sfm.py", "signal.signal"),  # puts back what pycolmap replaces at its import
-    ("mmpi_ns/prepare/features.py", "warnings.simplefilter"),  # in a block that puts the filters back
+    ("mmpi_priors/sfm.py", "signal.signal"),  # puts back what pycolmap replaces at its import
+    ("mmpi_prepare/features.py", "warnings.simplefilter"),  # in a block that puts the filters back
     ("mmpi_ns/bench/gpu.py", "warnings.simplefilter"),  # likewise
 }
 

@@ -22,8 +22,8 @@ from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.layout import dense, dense_fields, frame_rows, shaped
 from mmpi_ns.ops.march import shown
 from mmpi_ns.ops.march.rays import Rays, Shown
-from mmpi_ns.scene.baked import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, tiles_of
 from mmpi_ns.scene.geometry import Frames
+from mmpi_show.scene import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, tiles_of
 
 
 @operation()

@@ -23,8 +23,8 @@ from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
-from mmpi_ns.scene.baked import columns_from
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
+from mmpi_show.scene import columns_from
 
 BLEND_BLOCK = 16
 """Samples of a ray between two checks whether it is already opaque."""

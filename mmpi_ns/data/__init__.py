@@ -1,0 +1,1 @@
+"""From a folder to batches of rays: data set, data manager, rays, checks of a scene."""

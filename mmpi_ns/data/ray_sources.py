@@ -1,0 +1,244 @@
+"""Sources of the rays of a training step: pixels, points that two images share, and SfM keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Int16, UInt8
+from nerfstudio.cameras.rays import RayBundle
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.rays import Rays
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.parallel import in_order
+from mmpi_ns.utils.random_draws import generator
+from mmpi_priors.known_depth import KnownDepth, unpacked
+from mmpi_priors.new_views import SharedPoints
+
+KEYPOINT_DEPTH = "keypoint_inverse_distance"
+"""Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
+PIXEL_DEPTH = "pixel_inverse_distance"
+"""Ray-bundle metadata [R, 2]: inverse distance of the content of a pixel and its expected error, 0 where unknown."""
+EXPOSURE = "exposure"
+"""Ray-bundle metadata [R, 3]: colour in the ray's image over colour in the field; only where exposures differ."""
+OWN_PIXEL = "is_own_pixel"
+"""Ray-bundle metadata [R, 1]: whether a ray goes through a pixel of a training image."""
+
+
+@dataclass(frozen=True)
+class PixelPool:
+    """The pixels P of some images, image by image, on the device; those of images I are drawn.
+
+    If all pixels of an image are here, row and column of a pixel follow from its index.
+    """
+
+    colors: UInt8[Tensor, "P C"]
+    """C = 3 or 4."""
+    images: Int[Tensor, "I"]
+    """Numbers of the images in the data set."""
+    widths: Int[Tensor, "I"]
+    begins: Int[Tensor, "I"]
+    """Index of each image's first pixel."""
+    ends: Int[Tensor, "I"]
+    places: Int[Tensor, "P"] | None
+    """row * width + column of each pixel; None if all pixels are here."""
+    depths: Int16[Tensor, "P 2"] | None
+    """Inverse distance of each pixel and its expected error, as ``known_depth.packed``; None if none is known."""
+
+    @staticmethod
+    def from_dataset(
+        dataset: MMPIDataset,
+        device: str | torch.device,
+        images: Sequence[int],
+        known_depth: KnownDepth | None,
+        most: int,
+        seed: int,
+    ) -> PixelPool:
+        """Reads some training images once; masked pixels are left out.
+
+        Of more than ``most`` pixels, unless that is 0, a random subset is read, the same fraction of each image. Raises
+        InputError naming an image or mask that cannot be used, or if the masks leave nothing.
+        """
+        widths, heights = (x.reshape(-1).tolist() for x in (dataset.cameras.width, dataset.cameras.height))
+        sizes = [widths[i] * heights[i] for i in images]
+        share = min(1.0, most / sum(sizes)) if most else 1.0
+        whole = share == 1.0 and not dataset.has_masks
+        room = sum(int(share * size) for size in sizes)
+        colors = torch.empty(room, 4 if dataset.has_alpha else 3, dtype=torch.uint8)
+        places = None if whole else torch.empty(room, dtype=torch.int32)
+        depths = None if known_depth is None else torch.empty(room, 2, dtype=torch.int16)
+        starts = [0]
+        for i, (image, kept) in zip(
+            images, in_order(lambda i: _pixels_of(dataset, i, share, seed), images), strict=True
+        ):
+            starts.append(starts[-1] + len(kept))
+            rows = slice(*starts[-2:])
+            colors[rows, : image.shape[1]] = image[kept]
+            colors[rows, image.shape[1] :] = 255  # opaque where the image has no alpha and another one has
+            if places is not None:
+                places[rows] = kept.int()
+            if depths is not None and known_depth is not None:
+                depths[rows] = torch.from_numpy(np.require(known_depth.codes[i], requirements="W")).reshape(-1, 2)[kept]
+        if not starts[-1]:
+            raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
+        rows = slice(starts[-1])
+        places, depths = (None if x is None else x[rows].to(device) for x in (places, depths))
+        columns = images, [widths[i] for i in images], starts[:-1], starts[1:]
+        numbers, image_widths, begins, ends = (torch.tensor(column, device=device) for column in columns)
+        return PixelPool(colors[rows].to(device), numbers, image_widths, begins, ends, places, depths)
+
+    @cached_property
+    def count(self) -> int:
+        """Number of pixels that are drawn from; asked of the device once, not in every step."""
+        return int((self.ends - self.begins).sum())
+
+    def draw(
+        self, count: int, g: torch.Generator
+    ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
+        """Colours, (image, row, column) and depths of ``count`` random pixels."""
+        after = (self.ends - self.begins).cumsum(0)
+        drawn = torch.randint(self.count, (count,), generator=g, device=g.device).to(self.colors.device)
+        which = torch.searchsorted(after, drawn, right=True)
+        chosen = drawn - after[which] + self.ends[which]
+        place = chosen - self.begins[which] if self.places is None else self.places[chosen].long()
+        width = self.widths[which]
+        indices = torch.stack([self.images[which], place // width, place % width], -1)
+        nothing = torch.zeros(count, 2, device=self.colors.device)
+        depths = nothing if self.depths is None else unpacked(self.depths[chosen])
+        return self.colors[chosen].float() / 255, indices, depths
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the pixels themselves."""
+        return sum(x.nbytes for x in (self.colors, self.places, self.depths) if x is not None)
+
+
+def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
+    """The pixels of an image, and the indices to keep: a share of the pixels outside the mask."""
+    data = dataset.get_data(i, image_type="uint8")
+    image = data["image"].reshape(-1, data["image"].shape[-1])
+    kept = torch.arange(len(image))
+    if share < 1:
+        chosen = torch.randperm(len(image), generator=generator(seed, i, "resident"))[: int(share * len(image))]
+        kept = torch.zeros(len(image), dtype=torch.bool).index_fill_(0, chosen, True).nonzero()[:, 0]
+    if "mask" in data:
+        kept = kept[data["mask"].reshape(-1).bool()[kept]]
+    return image, kept
+
+
+def rays_to_keypoints(
+    observations: Observations, device: str | torch.device, images: Sequence[int]
+) -> RayBundle | None:
+    """Rays from some training cameras to the SfM points that they saw, with ``KEYPOINT_DEPTH``; None if there are none.
+
+    A ray goes to the point itself, a fraction of a pixel from the keypoint, so no lens model is needed.
+    """
+    cameras, points = observations.tracked
+    chosen = np.isin(cameras, images)
+    if not chosen.any():
+        return None
+    cameras, points = cameras[chosen], points[chosen]
+    origins = observations.centers[cameras]
+    distance = np.maximum(np.linalg.norm(points - origins, axis=-1, keepdims=True), 1e-12)
+    parts = origins, (points - origins) / distance, 1 / distance
+    origins, directions, inverse = (torch.from_numpy(x).float().to(device) for x in parts)
+    numbers = torch.from_numpy(cameras)[:, None].to(device)
+    return RayBundle(origins, directions, torch.ones_like(inverse), numbers, metadata={KEYPOINT_DEPTH: inverse})
+
+
+@dataclass(frozen=True)
+class RaySources:
+    """Sources of the rays of a step, for all training cameras or for one window's."""
+
+    pixels: PixelPool
+    new_views: SharedPoints | None
+    keypoints: RayBundle | None
+    """By ``rays_to_keypoints``."""
+    rays: Rays
+    """Makes rays through pixel centres (image, row, column)."""
+    new_view_share: float
+    """Rays of new views for each pixel ray."""
+    keypoint_rays: int
+    """Keypoint rays of a step without new views."""
+    no_new_views: str
+    """Reason why there are no new views, if there are none."""
+    exposures: Float[Tensor, "M 3"] | None = None
+    """Colours of each training image over those of the field; None if all have the same exposure."""
+
+    def of_images(self, images: NDArray[np.int64]) -> RaySources:
+        """The sources of some images. Raises InputError if masks leave them no pixel."""
+        numbers, keypoints, pool = torch.from_numpy(images), self.keypoints, self.pixels
+        left = (torch.isin(pool.images, numbers.to(pool.images)) & (pool.ends > pool.begins)).nonzero()[:, 0]
+        if not len(left):
+            raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+        if keypoints is not None and keypoints.camera_indices is not None:
+            cameras = keypoints.camera_indices[:, 0]
+            kept = torch.isin(cameras, numbers.to(cameras)).nonzero()[:, 0]
+            keypoints = keypoints[kept] if len(kept) else None
+        return replace(
+            self,
+            pixels=replace(pool, **{n: getattr(pool, n)[left] for n in ("images", "widths", "begins", "ends")}),
+            new_views=self.new_views and self.new_views.of_images(numbers),
+            keypoints=keypoints,
+            no_new_views=self.no_new_views if self.new_views is None else "no two of these images show a point alike",
+        )
+
+    def counts(self, pixel_rays: int) -> tuple[int, int, int]:
+        """Rays of pixels, new views and keypoints in a step."""
+        cover = 0.0 if self.new_views is None else min(1.0, self.new_views.cover)
+        new_view_rays = round(cover * round(self.new_view_share * pixel_rays))
+        # Points shared by two images are more informative than keypoints, which replace the missing ones.
+        keypoint_rays = 0 if self.keypoints is None else round((1 - cover) * self.keypoint_rays)
+        return pixel_rays, new_view_rays, keypoint_rays
+
+    def describe(self, pixel_rays: int) -> str:
+        """The share of each source in a step, with the reason where it is none, in one line."""
+        counts = self.counts(pixel_rays)
+        no_keypoints = "no SfM tracks" if self.keypoints is None else "new views take their place"
+        no_keypoints = no_keypoints if self.keypoint_rays else "--pipeline.datamanager.keypoint-rays 0"
+        reasons = ("", self.no_new_views, no_keypoints)
+        shares = [
+            f"{round(100 * count / sum(counts))} % {name}" + ("" if count else f" ({reason})")
+            for count, name, reason in zip(counts, ("pixels", "new views", "keypoints"), reasons, strict=True)
+        ]
+        return f"Rays of a step: {', '.join(shares)}."
+
+    def draw(
+        self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
+    ) -> tuple[RayBundle, dict[str, Tensor]]:
+        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and what images say of them.
+
+        Returns:
+            The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH, OWN_PIXEL and EXPOSURE in their metadata. The batch: ``image``,
+            colours of the rays of pixels and new views, at the exposure of the field [R, C], and ``indices``, image,
+            row and column of the pixels [N, 3].
+        """
+        colors, indices, depths = self.pixels.draw(pixel_rays, g)
+        if self.exposures is not None:
+            colors[:, :3] /= self.exposures[indices[:, 0]]
+        bundles, device = [self.rays(indices)], colors.device
+        _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays)
+        if self.new_views is not None and new_view_rays:
+            views, seen, distances = self.new_views.draw(new_view_rays, self.rays, g, self.exposures)
+            bundles.append(views)
+            colors, depths = torch.cat([colors, seen]), torch.cat([depths, distances])
+        keypoint_depths = torch.zeros(len(colors), 1, device=device)
+        if self.keypoints is not None and keypoint_rays:
+            chosen = torch.randint(len(self.keypoints), (keypoint_rays,), generator=g, device=g.device)
+            bundles.append(self.keypoints[chosen.to(device)])
+            keypoint_depths = torch.cat([keypoint_depths, bundles[-1].metadata[KEYPOINT_DEPTH]])
+            depths = torch.cat([depths, depths.new_zeros(keypoint_rays, 2)])
+        fields = ("origins", "directions", "pixel_area", "camera_indices")
+        joined = {name: torch.cat([getattr(bundle, name) for bundle in bundles]) for name in fields}
+        is_own_pixel = (torch.arange(len(depths), device=device) < len(indices))[:, None]
+        metadata = {OWN_PIXEL: is_own_pixel, KEYPOINT_DEPTH: keypoint_depths, PIXEL_DEPTH: depths}
+        if self.exposures is not None:
+            metadata[EXPOSURE] = self.exposures[joined["camera_indices"][:, 0]]
+        return RayBundle(**joined, metadata=metadata), {"image": colors, "indices": indices}

@@ -1,1 +1,0 @@
-"""Export of trained models: baked scenes, a web page for them, splats."""

@@ -1,0 +1,390 @@
+"""Input to scene: the stages in order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+from filelock import FileLock, Timeout
+from scipy.cluster.hierarchy import DisjointSet
+
+from mmpi_ns.utils.errors import FULL, InputError, looked_at, progress, quoted, say
+from mmpi_ns.utils.files import whole, write_text
+from mmpi_ns.utils.values import check_options
+from mmpi_prepare import checks, export, features, images
+from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, map_known_poses
+from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
+from mmpi_prepare.mapping import Task, map_and_judge
+from mmpi_prepare.poses import GIVEN_COUNTS, make_cameras, opencv_camera, read_poses
+from mmpi_prepare.settings import RANGES, Settings, read_lists
+from mmpi_prepare.verdict import REMEDY, Verdict
+from mmpi_priors.sfm import load_pycolmap, match_pairs, new_model, quiet, rigid3d
+from mmpi_priors.tracks import near_pairs
+
+WORK = ".prepare"
+WORDS = {"input": "reading", "masks": "reading", "features": "features", "matches": "matching", "model": "mapping"}
+"""The stages in words, for the times in the report."""
+LEFT = 1 << 20
+"""Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
+LEAST_IMAGES = 3
+"""From which poses can be found; COLMAP's mappers make no smaller model."""
+LEAST_SHARE = 0.5
+"""Share of the images that must be registered, unless --allow-partial."""
+
+
+class Preparation:
+    """A run of mmpi-prepare in stages. The work folder holds what an interrupted run left, a folder for each stage.
+
+    A stage is valid while its own settings and those of all earlier ones are unchanged, and is skipped if it was
+    finished; the first that changed is emptied, and so are all after it. An interrupted stage finds its own partial
+    output again.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.work = settings.scene / WORK
+        self.image_folder = self.work / "input" / "images"
+        self.times: dict[str, float] = {}
+        self.key = ""
+
+    def run(self) -> Verdict:
+        """Input to scene; how far it can be believed."""
+        s = self.settings
+        self._read()
+        source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
+        cameras = self.numbers, self.cameras
+        how = self.image_folder, self.photos, cameras, self.masks, s.max_features, s.threads
+        folder, _ = self._stage("features", source, partial(features.extract, *how))
+        poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
+        source = [s.matching, s.overlap, poses]
+        folder, self.matching = self._stage("matches", source, partial(self._match, folder / features.DATABASE))
+        say(f"Matching: {self.matching}.")
+        source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
+        folder, self.mapped = self._stage("model", source, partial(self._map, folder / features.DATABASE))
+        model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
+        count, total = model.num_reg_images(), len(self.photos)
+        if count < LEAST_SHARE * total and not s.allow_partial:
+            groups = "".join(f" Another group of {len(g)}: {in_short(g)}." for g in self.mapped["groups"])
+            raise InputError(
+                f"Only {count} of {total} images could be registered: {in_short(camera_poses(model)[0])}."
+                f"{groups} The groups need images that connect them. For a scene of the {count} alone: "
+                "--allow-partial. What was found so far is kept, and a new run goes on from it."
+            )
+        if verdict.grade == "broken" and not s.allow_doubtful:
+            raise InputError(
+                f"The track that was found is wrong, so no scene was made. {verdict.says} {REMEDY} "
+                "To look at it all the same: --allow-doubtful."
+            )
+        return self._write(model, verdict)
+
+    def _stage(self, name: str, settings: Any, make: Callable[[Path], Any]) -> tuple[Path, Any]:
+        """A stage's own folder, and the JSON that ``make``, which fills the folder, returned now or before: by these
+        settings, which are all that it depends on besides the earlier stages."""
+        text = self.key + name + json.dumps(settings, sort_keys=True, default=str)
+        self.key = hashlib.sha256(text.encode()).hexdigest()
+        folder, stamp, start = self.work / name, self.work / f"{name}.json", time.monotonic()
+        try:
+            state = json.loads(stamp.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            state = {}  # missing or truncated: the stage starts over
+        if state.get("key") != self.key:
+            shutil.rmtree(folder, ignore_errors=True)
+            state = {"key": self.key}
+            write_text(stamp, json.dumps(state))
+        if "result" in state:
+            say(f"{name}: done before", "dim")
+        else:
+            folder.mkdir(exist_ok=True)
+            state["result"] = make(folder)
+            write_text(stamp, json.dumps(state))
+        self.times[WORDS[name]] = self.times.get(WORDS[name], 0.0) + time.monotonic() - start
+        return folder, state["result"]
+
+    def _read(self) -> None:
+        """Images, masks and known poses, whether the images come in the order of the motion, and their cameras with
+        whether intrinsics are to be kept."""
+        s = self.settings
+        self.is_video = s.input.is_file()
+        if self.is_video and s.input.suffix.lower() not in images.VIDEOS:
+            raise InputError(f"{s.input} is neither a folder nor a video ({', '.join(images.VIDEOS)}).")
+        files = [s.input] if self.is_video else images.find_images(s.input)
+        source = [(str(p), p.stat().st_size, p.stat().st_mtime) for p in files]
+        source = [*source[0], s.max_frames, s.frame_motion] if self.is_video else source
+        read = partial(images.gather, s.input, files)
+        if self.is_video:
+            read = partial(select_frames, s.input, max_frames=s.max_frames, step=s.frame_motion)
+        _, entries = self._stage("input", source, lambda folder: [asdict(photo) for photo in read(folder)])
+        self.photos = [Photo(**entry) for entry in entries]
+        self.is_ordered = self.is_video or features.are_numbered([p.name for p in self.photos])
+        self.masks = None
+        if s.masks is not None:
+            stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
+            self.masks, _ = self._stage("masks", stamps, partial(images.gather_masks, s.masks, self.photos))
+        self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
+        if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
+            raise InputError(
+                f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
+                "(better twenty), or give known poses (--poses)."
+            )
+        # What is impossible is refused before the work.
+        self._split([p.name for p in self.photos])
+        smallest = min(self.photos, key=lambda p: min(p.width, p.height))
+        for factor in s.downscales:
+            if factor > min(smallest.width, smallest.height):
+                raise InputError(f"--downscales {factor} leaves no pixel of {smallest.name}: give smaller factors.")
+        lenses = self.known_poses.intrinsics if self.known_poses else {}
+        if s.camera is not None:
+            numbers = (s.camera[0], *s.camera) if len(s.camera) == 3 else s.camera
+            lenses = dict.fromkeys((p.name for p in self.photos), opencv_camera(numbers, s.lens == "fisheye"))
+        elif s.focal is not None:
+            lenses = {}
+        self.numbers, self.cameras = make_cameras(self.photos, s.intrinsics, lenses, s.focal, s.lens)
+        is_given = bool(lenses) or s.focal is not None
+        if self.known_poses is not None and not is_given and not all(p.exif_focal for p in self.photos):
+            raise InputError("Known poses need the intrinsics they were made with: give --focal or --camera.")
+        self.is_fixed = (is_given or self.known_poses is not None) and not s.refine_intrinsics
+
+    def _match(self, unmatched: Path, folder: Path) -> str:
+        """Makes the database with verified matches; what was matched in words."""
+        s, database, names = self.settings, folder / features.DATABASE, [p.name for p in self.photos]
+        if not database.exists():
+            with whole(database) as unfinished:
+                shutil.copyfile(unmatched, unfinished)
+        if self.known_poses is not None and s.matching == "auto":
+            places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
+            poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
+            pairs = [(places[i], places[j]) for i, j in near_pairs(poses[:, :3], 2 * s.overlap)]
+            says = f"the {2 * s.overlap} nearest by pose"
+        else:
+            alike = features.image_similarity(database, len(names))
+            pairs, says = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
+        with progress("Matching pairs", len(pairs)) as advance, quiet():
+            for start in range(0, len(pairs), features.PAIR_BATCH):  # but for those matched before
+                batch = [(names[i], names[j]) for i, j in pairs[start : start + features.PAIR_BATCH]]
+                match_pairs(database, batch, threads=s.threads)
+                advance(len(batch))
+        return f"{says}; {len(features.matching_pairs(database))} of {len(pairs)} pairs match"
+
+    def _map(self, database: Path, folder: Path) -> dict[str, Any]:
+        """Makes the model; how, the verdict, the interval of a refined focal length, and groups of at least
+        three images without a pose that verified matches connect, the largest first."""
+        s, names = self.settings, [p.name for p in self.photos]
+        verdict, groups, focal = Verdict("right"), [], None
+        if self.known_poses is not None:
+            poses = {n: rigid3d(p) for n, p in self.known_poses.poses.items()}
+            model = new_model(self.cameras, names, self.numbers, poses)
+            refine = not self.is_fixed and s.refine_intrinsics
+            model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
+            says = f"{self.known_poses.says}; {says}"
+        else:
+            lens, is_sequence = not self.is_fixed, self.matching.startswith("sequential")
+            free = lens, lens and s.lens == "auto", s.camera is None or s.refine_intrinsics
+            model, says, verdict = map_and_judge(
+                Task(database, self.image_folder, folder, names, *free, s.threads, is_sequence, self.is_ordered)
+            )
+            lost = sorted(set(range(1, len(names) + 1)) - set(model.reg_image_ids()))
+            connected = DisjointSet(lost)
+            for first, second in features.matching_pairs(database):
+                if first in connected and second in connected:
+                    connected.merge(first, second)
+            subsets = sorted((sorted(group) for group in connected.subsets() if len(group) > 2), key=len, reverse=True)
+            groups = [[names[i - 1] for i in group] for group in subsets]
+        (folder / "model").mkdir(exist_ok=True)
+        model.write(folder / "model")
+        if not self.is_fixed:
+            with progress("Checking the focal length", 1) as advance:
+                focal = focal_interval(model, s.threads)
+                advance()
+        return {"says": says, "verdict": asdict(verdict), "focal": focal, "groups": groups}
+
+    def _write(self, model: pycolmap.Reconstruction, verdict: Verdict) -> Verdict:
+        """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
+        s, says = self.settings, self.mapped["says"]
+        up = unit = "that of the given poses"
+        if self.known_poses is None or s.camera_height is not None:
+            similarity, up, unit = choose_frame(model, s.camera_height)
+            model.transform(similarity)
+        names = set(camera_poses(model)[0])
+        photos = [p for p in self.photos if p.name in names]
+        split = self._split([p.name for p in photos])
+        folder, flat, built = self.image_folder, self.work / "undistorted", self.work / "scene"
+        shutil.rmtree(flat, ignore_errors=True)
+        shutil.rmtree(built, ignore_errors=True)
+        findings, masks, moves = self._check(model, photos, split, built)
+        grave = [f"{f.says[:1].upper()}{f.says[1:]}." for f in findings if f.is_grave]
+        if grave and self.known_poses is None and verdict.grade == "right":
+            verdict = Verdict("doubtful", " ".join(grave))
+        if s.undistort:
+            model, photos = export.undistort(model, photos, folder, masks, flat, s.threads)
+            folder, masks = flat / "images", flat / "masks" if masks else None
+        export.write_images(folder, masks, photos, built, s.downscales)
+        notes = {"unit": unit, "up": up, "mapping": says, "matching": self.matching}
+        (built / "colmap/sparse/0").mkdir(parents=True)
+        model.write(built / "colmap/sparse/0")
+        model.export_PLY(built / "sparse_pc.ply")
+        write_text(built / "transforms.json", json.dumps(export.transforms(model, split, bool(masks), notes), indent=1))
+        rows = {
+            "images registered": f"{len(photos)} of {len(self.photos)}",
+            "matching": self.matching,
+            "mapping": says,
+            "verdict": f"{verdict.grade} {verdict.says}".strip(),
+            "focal length": self.mapped["focal"][1] if self.mapped["focal"] else "given",
+            "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
+            "what moves": moves,
+            "up": up,
+            "unit": unit,
+            "split": f"{len(split.train)} train, {len(split.test)} test: {split.says}",
+            "times": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.times.items()),
+        }
+        intrinsics = "given and kept" if self.is_fixed else "refined"
+        lens = "undone" if s.undistort else "kept in transforms.json"
+        note = f"Intrinsics {intrinsics}; {len(self.cameras)} camera(s); lens distortion {lens}."
+        groups = self.mapped["groups"]
+        lost = [p.name for p in self.photos if p.name not in names.union(*groups)]
+        apart = "images form a group of their own, not connected to the scene"
+        left_out = [f"{len(lost)} images have no pose and are left out: {in_short(lost, 8)}"] if lost else []
+        left_out += [f"{len(group)} {apart}: {in_short(group, 8)}" for group in groups]
+        checks.write_report(model, s.input.name, rows, findings, left_out, note, built)
+        self._publish([*left_out, *checks.by_kind(findings)], model, verdict, split)
+        return verdict
+
+    def _split(self, names: Sequence[str]) -> export.Split:
+        s = self.settings
+        if s.split_from is not None:
+            return export.split_images(names, lists=read_lists(s.split_from), source=s.split_from.name)
+        if self.known_poses is not None and self.known_poses.split and s.test_every is None and s.train_every is None:
+            return export.split_images(names, lists=self.known_poses.split, source=f"{s.poses}")
+        return export.split_images(names, s.test_every, s.train_every)
+
+    def _check(
+        self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split, built: Path
+    ) -> tuple[list[checks.Finding], Path | None, str]:
+        """Findings on the scene to be built; the folder of its masks, given or of what moves; what moves in words."""
+        s, names, sharp = self.settings, [p.name for p in photos], np.zeros(len(photos))
+        findings = checks.doubtful_intrinsics(model, self.is_fixed, self.mapped["focal"], s.threads)
+        with progress("Checking images", len(names)) as advance:
+            for i, name in enumerate(names):
+                gray = cv2.imread(str(self.image_folder / name), cv2.IMREAD_GRAYSCALE)
+                if gray is None:
+                    raise InputError(f"{name} cannot be read: repair or remove it.")
+                sharp[i] = sharpness(gray)  # type: ignore[arg-type]
+                advance(1)
+        findings += checks.blurred(names, sharp, self.is_ordered)
+        if self.is_ordered:
+            order, poses = camera_poses(model)
+            offered = [p.name for p in self.photos]
+            findings += checks.misplaced(order, [offered.index(n) for n in order], poses)
+        if s.moving == "keep" or self.masks is not None:
+            return findings, self.masks, "masks given" if self.masks else "not looked for"
+        from mmpi_prepare.moving import write_masks  # imports nerfstudio, which takes seconds
+
+        target, picture = self.work / "moving", built / "report" / "moving.jpg"
+        moves, doubt = write_masks(model, photos, split.train, self.image_folder, target, picture, s.threads)
+        findings += [checks.Finding("moving?", "", doubt)] if doubt else []
+        if not moves:
+            return findings, None, "nothing is seen to move"
+        moving, fate = sum(moves.values()) / len(split.train), "are masked" if s.moving == "mask" else "move"
+        says = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
+        say(f"What moves: {says}; report/moving.jpg shows them.")
+        if s.moving == "mask":
+            return findings, target, says
+        words = "of the image moves: mask it (--moving mask, or --masks)"
+        return [*findings, *(checks.Finding("moving?", n, f"{x:.0%} {words}", x) for n, x in moves.items())], None, says
+
+    def _publish(
+        self, warnings: Sequence[str], model: pycolmap.Reconstruction, verdict: Verdict, split: export.Split
+    ) -> None:
+        """Moves the scene into place and reports the result; doubtful ones in red."""
+        scene = self.settings.scene
+        aside = scene / next(f"previous-{i}" for i in range(1, 10_000) if not (scene / f"previous-{i}").exists())
+        export.publish(self.work / "scene", scene, aside)
+        if aside.exists():
+            say(f"What {scene} held is in {aside}.")
+        if not self.settings.keep_work:
+            shutil.rmtree(self.work)
+        for line in warnings:
+            say(line, "yellow")
+        is_right = verdict.grade == "right"
+        if not is_right:
+            say(f"This scene is {verdict.grade}: {verdict.says} {REMEDY}", "bold red")
+        say(
+            f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
+            f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
+            "bold red" if not is_right else "" if warnings else "green",
+        )
+        say(f"ns-train mmpi-small --data {quoted(scene)}")
+
+
+@contextmanager
+def only_one(work: Path) -> Iterator[None]:
+    """Locks a work folder against a second run. Raises InputError if one is at work there, or the disk is full."""
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+        with FileLock(work / "lock", blocking=False):
+            yield
+    except Timeout as error:
+        raise InputError(f"Another mmpi-prepare is making {work.parent}: wait for it, or name another.") from error
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError) as error:
+        free = shutil.disk_usage(next(p for p in work.parents if p.is_dir())).free
+        if getattr(error, "errno", None) in FULL or free < LEFT:
+            says = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
+            raise InputError(says) from error
+        if isinstance(error, OSError):
+            says = f"{error.filename or work} cannot be read or written ({error.strerror or error}): check the path."
+            raise InputError(says) from error
+        raise
+
+
+def prepare(s: Settings) -> Verdict:
+    """Makes the scene; returns how far it can be believed.
+
+    Before any work it raises InputError if an option is out of range, contradicts another or names no file, the input
+    is missing, or something would be lost in the scene's folder; later, if the input cannot be made into a scene.
+    """
+    load_pycolmap()  # in a version that is new enough
+    check_options(s, {name: number for name, number in RANGES.items() if getattr(s, name) is not None}, "--")
+    every, threads = (s.test_every, s.train_every), s.threads
+    source, scene, kinds = s.input.resolve(), s.scene.resolve(), " or ".join(GIVEN_COUNTS.values())
+    camera = (1.0,) * 4 if s.camera is None else s.camera
+    focals = camera[: 1 if len(camera) == 3 else 2]
+    faults = {
+        f"--camera takes {kinds}, not {len(camera)} numbers.": len(camera) not in GIVEN_COUNTS,
+        "--camera: focal lengths must be positive, in pixels.": min(focals, default=1) <= 0,
+        "--focal and --camera both give a focal length: leave one out.": None not in (s.focal, s.camera),
+        "--test-every and --train-every contradict each other: leave one out.": None not in every,
+        f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.": (s.test_every or 2) < 2,
+        f"--downscales takes different numbers, not {s.downscales}.": len(set(s.downscales)) < len(s.downscales),
+        f"--threads takes a number of threads, or -1 for all cores, not {threads}.": threads < 1 and threads != -1,
+        "--refine-poses refines known poses: give them with --poses.": s.refine_poses and s.poses is None,
+        f"--poses {s.poses} does not exist.": s.poses is not None and not s.poses.exists(),
+        f"--masks {s.masks} is no folder.": s.masks is not None and not s.masks.is_dir(),
+        f"There is no {looked_at(s.input)}: check the path.": not source.exists(),
+        f"{s.scene} is a file: name a folder for the scene.": s.scene.is_file(),
+    }
+    for says in (says for says, is_wrong in faults.items() if is_wrong):
+        raise InputError(says)
+    if s.split_from is not None:
+        read_lists(s.split_from)
+    taken = export.existing_parts(scene)
+    if scene == source or source in scene.parents or any((scene / part) in (source, *source.parents) for part in taken):
+        raise InputError(f"The scene {s.scene} would be mixed with its input: name another folder.")
+    if taken and not s.overwrite:
+        raise InputError(
+            f"{s.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite (the old files are "
+            "then moved aside)."
+        )
+    with only_one(s.scene / WORK):
+        return Preparation(s).run()

@@ -1,0 +1,237 @@
+"""The cameras that SfM starts from, and known poses: KITTI, TUM, transforms.json, 4x4 text files, matched with the
+images."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pycolmap
+
+from mmpi_ns.utils.errors import InputError, say
+from mmpi_prepare.adjustment import Array, nearest_rotation
+from mmpi_prepare.images import IMAGES, Photo, natural_key
+
+Lens = Literal["auto", "pinhole", "radial", "opencv", "fisheye"]
+Sharing = Literal["auto", "shared", "per-image"]
+MODELS = {"pinhole": "PINHOLE", "radial": "SIMPLE_RADIAL", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+GUESSED_FOCAL = 1.2
+"""Focal length over the longer side if nothing is known: COLMAP's guess."""
+GIVEN_COUNTS = {3: "f cx cy", 4: "fx fy cx cy", 8: "fx fy cx cy k1 k2 p1 p2"}
+MAX_LAG = 0.05
+"""Maximum time in seconds between an image and its pose."""
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+KIND = re.compile(r"[._-]?(pose|color|rgb|image)s?$", re.IGNORECASE)
+"""End of a name that differs between images and poses: frame-000001.color.png, frame-000001.pose.txt."""
+
+
+def opencv_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:
+    """A camera of no size by fx, fy, cx, cy and the terms of its lens, k1, k2, p1, p2 or k1 to k4 of a fisheye; a
+    pinhole where there are none."""
+    model = "OPENCV_FISHEYE" if fisheye else "OPENCV" if any(values[4:]) else "PINHOLE"
+    return pycolmap.Camera(model=model, params=[*values, 0.0, 0.0, 0.0, 0.0][: 4 if model == "PINHOLE" else 8])
+
+
+def make_cameras(
+    photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, pycolmap.Camera], focal: float | None, lens: Lens
+) -> tuple[list[int], list[pycolmap.Camera]]:
+    """Cameras from given intrinsics (``lenses`` by image name, ``focal`` in pixels), else from EXIF, else guessed;
+    images of one size, lens and known intrinsics share one, unless ``sharing`` says otherwise.
+
+    Returns the camera of each image, numbered from 1, and the cameras in this order. Raises InputError if images of
+    different sizes are to share one.
+    """
+    sizes = {(p.width, p.height) for p in photos}
+    if sharing == "shared" and len(sizes) > 1:
+        listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        raise InputError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
+    by_key: dict[Any, int] = {}
+    numbers: list[int] = []
+    cameras: list[pycolmap.Camera] = []
+    for photo in photos:
+        known = lenses.get(photo.name)
+        given = known and (known.model.name, *known.params)
+        key = (photo.width, photo.height, "" if sharing == "shared" else photo.lens, given)
+        number = by_key.setdefault(photo.name if sharing == "per-image" else key, len(cameras) + 1)
+        numbers.append(number)
+        if number <= len(cameras):
+            continue
+        if known is not None:
+            size = {"width": photo.width, "height": photo.height, "camera_id": number}
+            camera = pycolmap.Camera(model=known.model, params=known.params, **size)
+        else:
+            model = MODELS["radial" if lens == "auto" and focal is None else "pinhole" if lens == "auto" else lens]
+            guess = focal or photo.exif_focal or GUESSED_FOCAL * max(photo.width, photo.height)
+            camera = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
+        camera.has_prior_focal_length = bool(known or focal or photo.exif_focal)
+        cameras.append(camera)
+    return numbers, cameras
+
+
+def opencv_intrinsics(camera: pycolmap.Camera) -> tuple[list[float], bool]:
+    """The numbers of ``opencv_camera``, eight of them, and whether it is a fisheye. Raises InputError if
+    nerfstudio-data does not support the lens model."""
+    name, terms = camera.model.name, [float(v) for v in camera.params[camera.extra_params_idxs()]]
+    if name not in (*MODELS.values(), "SIMPLE_PINHOLE", "RADIAL"):
+        raise InputError(f"Lens model {name} is not supported in transforms.json.")
+    f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
+    return [*f, *terms, 0.0, 0.0, 0.0, 0.0][:8], name == "OPENCV_FISHEYE"
+
+
+@dataclass(frozen=True)
+class KnownPoses:
+    """Poses by image name."""
+
+    poses: dict[str, Array]
+    """Camera to world, OpenCV axes (x right, y down, z forward). [4, 4]"""
+    says: str
+    """Format and how images were matched, in words."""
+    intrinsics: dict[str, pycolmap.Camera] = field(default_factory=dict)
+    """Of the same images, from a transforms.json."""
+    split: dict[str, Any] | None = None
+    """A transforms.json's lists of files."""
+
+
+def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
+    """Reads known poses, a file or a folder of 4x4 text files, and matches them with the images. Raises InputError if
+    they are not understood, or fit fewer than two images."""
+    is_transforms = path.suffix.lower() == ".json"
+    if is_transforms or not path.is_dir():
+        read = (_read_transforms if is_transforms else _read_lines)(path, photos)
+    else:  # one text file for each image, by name, else in order
+        files = [p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")]
+        files.sort(key=lambda p: natural_key(p.name))
+        by_stem = {KIND.sub("", p.stem): p for p in files if p.is_file()}
+        chosen = {p.name: by_stem[stem] for p in photos if (stem := KIND.sub("", Path(p.source).stem)) in by_stem}
+        says = "4x4 matrices, by name"
+        if len(chosen) < 2:
+            if len(files) != len(photos):
+                raise InputError(f"{path} has {len(files)} files for {len(photos)} images, and the names do not match.")
+            chosen, says = {p.name: f for p, f in zip(photos, files, strict=True)}, "4x4 matrices, in order"
+        _check_apart(chosen, path)
+        poses = {}
+        for name, file in chosen.items():
+            try:
+                matrix = np.loadtxt(file, dtype=np.float64)
+            except ValueError as error:
+                raise InputError(f"{file} cannot be read ({error}).") from error
+            if matrix.shape not in ((4, 4), (3, 4)):
+                raise InputError(f"{file} is {matrix.shape}, not 4x4.")
+            poses[name] = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
+        read = KnownPoses(poses, says)
+    opengl = axes == "opengl" or (axes == "auto" and is_transforms)
+    flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
+    poses = {n: p @ flip for n, p in read.poses.items() if np.isfinite(p).all()}
+    for name, pose in poses.items():
+        stretch = np.linalg.svd(pose[:3, :3])[1]
+        if np.abs(stretch - 1).max() > 0.02 or np.linalg.det(pose[:3, :3]) < 0:
+            raise InputError(f"The pose of {name} is no rotation and translation (singular values {stretch.round(3)}).")
+        pose[:3, :3] = nearest_rotation(pose[:3, :3])
+    if len(poses) < 2:
+        raise InputError(f"--poses {path} has finite poses for {len(poses)} images: at least two are needed.")
+    if len(poses) < len(photos):
+        say(f"{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.", "yellow")
+    return replace(read, poses=poses)
+
+
+def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+    """Poses in the lines of a text file, in which # begins a comment.
+
+    KITTI: 12 numbers, a line for each image; of more lines, the numbers in the file names choose (counted from 0). TUM:
+    8 numbers, by time stamp if the file names are time stamps, else a line for each image.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
+    width, rows = len(next(filter(None, lines), [])), []
+    if width not in (8, 12):
+        formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
+        raise InputError(f"--poses {path} is not understood: {formats}.")
+    for number, fields in enumerate(lines, 1):
+        if not fields:
+            continue
+        try:
+            rows.append([float(f) for f in fields])
+        except ValueError as error:
+            raise InputError(f"{path}, line {number}: {error}.") from error
+        if len(fields) != width:
+            raise InputError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
+    numbers, poses = np.array(rows, dtype=np.float64), np.tile(np.eye(4), (len(rows), 1, 1))
+    places, says = list(range(len(photos))), "one line for each image"
+    if width == 12:
+        poses[:, :3] = numbers.reshape(-1, 3, 4)
+        if len(rows) != len(photos):
+            digits = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
+            places = [int(d[-1]) for d in digits if d]
+            if len(rows) < len(photos) or len(set(places)) < len(photos) or max(places) >= len(rows):
+                raise InputError(f"{path} has {len(rows)} poses for {len(photos)} images: they cannot be matched.")
+            says = "the lines that the images' numbers name (from 0)"
+        return KnownPoses({p.name: poses[i] for p, i in zip(photos, places, strict=True)}, f"KITTI poses, {says}")
+    for pose, row in zip(poses, numbers, strict=True):
+        pose[:3, :3] = pycolmap.Rotation3d(row[4:8]).matrix() if np.linalg.norm(row[4:8]) > 0 else np.nan
+        pose[:3, 3] = row[1:4]
+    matched: dict[str, Array] = {}
+    for photo in photos:
+        source = Path(photo.source)
+        stamps = re.findall(r"\d+\.\d+|\d+", source.stem if source.suffix.lower() in IMAGES else photo.source)
+        lags = np.abs(numbers[:, 0] - float(stamps[-1])) if stamps else np.full(1, np.inf)
+        if lags.min() <= MAX_LAG:
+            matched[photo.name] = poses[lags.argmin()]
+    if 2 * len(matched) >= len(photos):
+        return KnownPoses(matched, f"TUM poses, matched by time stamp within {MAX_LAG} s")
+    if len(rows) != len(photos):
+        raise InputError(
+            f"{path} has {len(rows)} poses for {len(photos)} images, and the images' names are not their time stamps."
+        )
+    return KnownPoses({p.name: pose for p, pose in zip(photos, poses, strict=True)}, f"TUM poses, {says}")
+
+
+def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+    """Poses of a transforms.json by file name, with its intrinsics and its lists of train and test files, if any."""
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+        frames: list[dict[str, Any]] = meta["frames"]
+        files = [Path(f["file_path"]) for f in frames]
+        places = {}  # the frame with an image's name, and its folder if several have that name
+        for photo in photos:
+            for name in (Path(photo.name), Path(photo.source)):
+                named = [n for n, f in enumerate(files) if f.stem == name.stem]
+                folders = name.parent.parts
+                inside = [n for n in named if files[n].parent.parts[-len(folders) :] == folders] if folders else []
+                if len(named) == 1 or len(inside) == 1:
+                    places[photo.name] = (inside or named)[0]
+                    break
+        _check_apart(places, path)
+        poses, intrinsics = {}, {}
+        for photo in (p for p in photos if p.name in places):
+            frame = meta | frames[places[photo.name]]
+            poses[photo.name] = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
+            if "fl_x" in frame:  # for images that may be smaller or larger than those of the file
+                fisheye = frame.get("camera_model") in FISHEYE
+                keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+                sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)
+                if abs(sx / sy - 1) > 0.02:
+                    raise InputError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
+                fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
+                cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
+                values = (fx * sx, fy * sy, cx * sx, cy * sy, *(float(frame.get(k, 0.0)) for k in keys))
+                intrinsics[photo.name] = opencv_camera(values, fisheye)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
+    split = meta if "train_filenames" in meta and "test_filenames" in meta else None
+    return KnownPoses(poses, "poses of a transforms.json, by name", intrinsics, split)
+
+
+def _check_apart(poses: dict[str, Any], path: Path) -> None:
+    """Raises InputError if two images were given the same pose, as images of two folders may have the same name."""
+    first: dict[Any, str] = {}
+    for name, pose in poses.items():
+        if pose in first:
+            raise InputError(
+                f"{path} has one pose for {first[pose]} and {name}: images of one name in two folders need two."
+            )
+        first[pose] = name

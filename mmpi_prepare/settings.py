@@ -1,0 +1,100 @@
+"""The options of mmpi-prepare."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.values import Number
+from mmpi_prepare.features import Matching
+from mmpi_prepare.poses import Lens, Sharing
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Makes a scene for ns-train from a folder of images or a video, by structure from motion or from known poses.
+
+    An interrupted run continues when it is started again with the same options.
+    """
+
+    input: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="INPUT")]
+    """Folder of images, or a video."""
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """Folder for the scene."""
+    masks: Path | None = None
+    """Folder of masks named like the images; black is left out, in SfM and in training."""
+    moving: Literal["mask", "warn", "keep"] = "mask"
+    """What to do about what moves in the training images, unless --masks are given: mask it in training, warn, or
+    neither."""
+    poses: Path | None = None
+    """Known poses: a KITTI or TUM file, a transforms.json, or a folder of 4x4 text files."""
+    poses_axes: Literal["auto", "opencv", "opengl"] = "auto"
+    """Camera axes of --poses (camera to world): auto is opengl for transforms.json and opencv for the others."""
+    refine_poses: bool = False
+    """Refine known poses by bundle adjustment; frame and scale are kept."""
+    focal: float | None = None
+    """Focal length in pixels of the input images; kept fixed unless --refine-intrinsics."""
+    camera: tuple[float, ...] | None = None
+    """f cx cy | fx fy cx cy | fx fy cx cy k1 k2 p1 p2 in pixels of the input; kept fixed unless --refine-intrinsics."""
+    lens: Lens = "auto"
+    """Distortion if --camera gives none. auto: none with --focal; else one radial term, or OpenCV's four if better."""
+    intrinsics: Sharing = "auto"
+    """auto: images with the same size, EXIF body and lens share a camera."""
+    refine_intrinsics: bool = False
+    """Refine given intrinsics."""
+    undistort: bool = False
+    """Undistort the images instead of writing the distortion to transforms.json."""
+    matching: Matching = "auto"
+    """auto: all pairs of few images; neighbours and revisits of a sequence; similar images of many."""
+    overlap: int = 10
+    """Frames before and after that each frame of a sequence is matched with."""
+    max_features: int = 4096
+    """Maximum SIFT features of an image; small images get one for every hundred pixels, or 2,048."""
+    camera_height: float | None = None
+    """Camera height above the ground in metres: sets the scale, and the up direction by the normal of the ground."""
+    test_every: int | None = None
+    """Every n-th image is a test image (default 8); 0: all are used for training and testing."""
+    train_every: int | None = None
+    """Every n-th image is a training image, the others are test images."""
+    split_from: Path | None = None
+    """JSON file with the train_filenames and test_filenames to use, such as another scene's transforms.json."""
+    downscales: tuple[int, ...] = (2, 4)
+    """Downscale factors of the copies."""
+    max_frames: int = 300
+    """Maximum number of frames from a video."""
+    frame_motion: float = 0.01
+    """Median motion between frames taken from a video, relative to the image width."""
+    allow_partial: bool = False
+    """Make a scene even if less than half of the images are registered."""
+    allow_doubtful: bool = False
+    """Make a scene even if the evidence shows that its track is wrong."""
+    overwrite: bool = False
+    """Replace the contents of the scene folder; the old files are moved to a folder beside the new ones."""
+    keep_work: bool = False
+    """Keep the features, matches and models in SCENE/.prepare."""
+    threads: Annotated[int, tyro.conf.arg(metavar="N")] = -1
+    """CPU threads; -1 for all cores."""
+
+
+RANGES = {
+    **dict.fromkeys(("focal", "camera_height", "frame_motion"), Number(0, above=True)),
+    **dict.fromkeys(("overlap", "max_features"), Number(1, whole=True)),
+    **dict.fromkeys(("train_every", "max_frames", "downscales"), Number(2, whole=True)),
+    "camera": Number(),
+}
+
+
+def read_lists(path: Path) -> dict[str, list[str]]:
+    """The train and test files that a JSON file lists. Raises InputError if it cannot be read, or lists none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {key: [str(n) for n in content[key]] for key in ("train_filenames", "test_filenames")}
+    except (OSError, ValueError) as error:
+        raise InputError(f"--split-from {path} cannot be read ({error}).") from error
+    except (KeyError, TypeError) as error:
+        raise InputError(f"--split-from {path} needs train_filenames and test_filenames.") from error

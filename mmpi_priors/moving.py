@@ -1,0 +1,378 @@
+"""What moves in the images of a scene: cars and people that no static scene explains, as masks.
+
+Every image is compared with its neighbours at reduced size (``moving_evidence.py``), also at depths that only something
+that moves can seem to have (``moving_sweep.py``); what is left over grows to objects (``moving_objects.py``). A second
+look near images in which something moves does without what moves in them, and only what it shows by itself is followed
+to other images; outlines are drawn anew at the end (``moving_outline.py``). Of a video, key images are compared with
+each other, and the images between them only where something moves near them.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+from rich.progress import track
+
+from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.errors import duration
+from mmpi_ns.utils.parallel import in_order, num_threads, one_thread_each
+from mmpi_priors.cache import Arrays, Computed, digest, remembered
+from mmpi_priors.dense import Depth, Progress, find_depths
+from mmpi_priors.moving_carry import Carried, carried
+from mmpi_priors.moving_doubt import doubt_of
+from mmpi_priors.moving_evidence import Evidence, Mask, Neighbour, Shot, evidence, ground_of
+from mmpi_priors.moving_follow import upright_objects
+from mmpi_priors.moving_objects import UNASKED, followed, grown, is_static, seeds, touching
+from mmpi_priors.moving_outline import outlined
+from mmpi_priors.moving_sweep import Sweep, sweep
+from mmpi_priors.observe import posed_images
+from mmpi_priors.people import has_detector, horizon_of, people_in
+from mmpi_priors.tracks import PosedImages, at_full_size
+from mmpi_priors.upright import upright
+from mmpi_priors.views import Parallax, View, look_up, project, straightened, straightened_color
+
+SIDE = 384
+"""Longer side of the images at which is compared, pixels."""
+RANKS = (0, 1, 2, 3, 5, 8)
+"""Neighbours that an image is compared with, by nearness: farther ones see what something slow hides from near ones."""
+MAX_ANGLE = 40.0
+"""Degrees between the facing directions of images that are compared."""
+ROUNDS = (2, 1)
+"""Of dense matching: at half the size, then at that size."""
+AFTER = 2
+"""Nearest neighbours from which objects are followed by optical flow."""
+FURTHER, SIDES, ASIDE = 2, 8, 0.005
+"""Times that objects are followed from image to image at the sides of a drive, at most; the part of an image's width
+that is its side, on the left and on the right, and the share of an image that must have been masked there since."""
+EDGE = 0.4
+"""Share of a mover around a pixel from which it is masked."""
+SECONDS = 0.35
+"""Processor seconds for an image, for the forecast (docs/moving.md)."""
+LARGE = 0.015
+"""Share of an image that must be masked in one of them, or nothing is but people,"""
+WALKERS = 4
+"""if they are found in so many images: in a few the detector may take a thing for a person."""
+COMPARED, FIRST, FEW = 0.02, 0.06, 30
+"""Median distance between points in a key image and in the next one, in widths, at most: of those that others are
+compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
+first. Fewer points tell nothing."""
+VERSION = 20
+"""Version of the algorithm: cached masks of another version are found anew."""
+ENOUGH, SAMPLES = 200, 5000
+"""Pixels of one depth in both images from which their exposures are compared, at least and at most."""
+SHOWN, COLUMNS, WIDTH = 24, 4, 320
+"""Images in the picture for reports, those in a row, and pixels across each."""
+RED = (0, 0, 127)
+"""Blue, green, red that half of a masked pixel's colour is replaced by."""
+
+
+def find_moving(
+    images: PosedImages,
+    points_of: Callable[[int], NDArray[np.float64]],
+    progress: Progress = lambda work, _: work,
+) -> tuple[list[View], list[Mask], str]:
+    """Views of images at working size, masks of what moves in them, and why these are doubtful, if they are, in a
+    sentence; the number of threads does not change it.
+
+    Args:
+        images: the originals.
+        points_of: SfM points [P, 3] that an image saw.
+        progress: wraps the images as they are worked on.
+    """
+    up = upright(images.camera_to_worlds)
+
+    def shot_of(i: int, view: View, depth: Depth) -> Shot:
+        color = cv2.GaussianBlur(straightened_color(images, i, view), (0, 0), 1.0)
+        ground, level = ground_of(view, depth, up), horizon_of(view, up)
+        horizon = None if ground is None else level
+        return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon, level=level)
+
+    keys = key_images(images, points_of, COMPARED)
+    shots = list(find_depths(images, points_of, SIDE, shot_of, progress, ROUNDS, keys))
+    near = [neighbours(images, i, keys) for i in range(len(shots))]
+    masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
+    nothing, first = masks.copy(), {}
+
+    def look(i: int) -> tuple[Mask, _Look]:
+        shots[i] = replace(shots[i], people=people_in(images, i, shots[i].view, up))
+        return _moves(shots, near[i], i, nothing, nothing[i], None)
+
+    with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
+        part = key_images(images, points_of, FIRST)
+        while part:
+            for i, (mask, seen) in zip(part, pool.map(look, part), strict=True):
+                masks[i], first[i] = mask, seen
+            part = [i for i in range(len(shots)) if i not in first and any(masks[j].any() for j in near[i])]
+        uprights = upright_objects(shots, near, masks, pool)
+        masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
+        again = [i for i in first if any(masks[j].any() for j in near[i])]
+        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i]), again))
+        for i, (mask, _) in zip(again, second, strict=True):
+            masks[i] = mask
+        looks = {i: look for i, (_, look) in zip(again, second, strict=True)}
+        masks = _followed_on(shots, near, masks, looks, pool)
+        # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
+        if max((mask.mean() for mask in masks), default=0.0) >= LARGE:
+            masks = _outlined(shots, near, masks, looks, pool)
+        else:  # walkers may stay away
+            walkers = {i: seen.walkers for i, seen in first.items() if seen.walkers.any()}
+            masks = [walkers[i] if i in walkers and len(walkers) >= WALKERS else nothing[i] for i in range(len(masks))]
+    return [shot.view for shot in shots], masks, doubt_of(shots, up, masks)
+
+
+def reaches_side(mask: Mask) -> bool:
+    """Whether a mask covers much of an image's left or right side."""
+    side = mask.shape[1] // SIDES
+    return max(int(mask[:, :side].sum()), int(mask[:, -side:].sum())) > ASIDE * mask.size
+
+
+def neighbours(images: PosedImages, i: int, keys: Sequence[int]) -> list[int]:
+    """The key images that an image is compared with, nearest first."""
+    nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE, keys)
+    return [nearest[rank] for rank in RANKS if rank < len(nearest)]
+
+
+def key_images(images: PosedImages, points_of: Callable[[int], NDArray[np.float64]], spacing: float) -> list[int]:
+    """Images as far apart, in their order, as can be with points at most ``spacing`` (median, in widths) from where the
+    last one shows them: all, but for those of a video that follow closely."""
+
+    def shift(i: int, j: int) -> float:
+        points = points_of(i)
+        if len(points) < FEW:
+            return np.inf
+        moved = np.linalg.norm(project(images, j, points) - project(images, i, points), axis=-1)
+        return float(np.median(moved)) / float(images.sizes[i].max())
+
+    keys, last = [0], len(images.files) - 1
+    while keys[-1] < last:
+        first = keys[-1]
+        far = (j for j in range(first + 1, last + 1) if not shift(first, j) < spacing)
+        keys.append(max(first + 1, next(far, last + 1) - 1))
+    return keys
+
+
+def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:
+    """A mask of an image's view as a mask of the image itself, lens included.
+
+    Args:
+        view: the image at working size.
+        mask: of the view.
+        images: the originals.
+        i: the image's place in them.
+        shape: height and width that are asked for; the image may be a copy of another size.
+    """
+    x, y = straightened(images, i, shape)
+    fx, fy, cx, cy = view.pinhole
+    return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE
+
+
+def moving_masks(observations: Observations, dataset: MMPIDataset) -> tuple[Sequence[Mask], str]:
+    """What moves in each training image [H, W], and the doubt of ``find_moving``, from the cache if possible; nothing
+    where lenses cannot be undone."""
+    shapes = [(int(h), int(w)) for w, h in observations.sizes]
+    posed = posed_images(observations, dataset)
+    if posed is None:
+        return [np.zeros(shape, bool) for shape in shapes], ""
+    original, (seen_by, points) = at_full_size(posed), observations.tracked
+
+    def find() -> Arrays:
+        # Names a damaged file, of which OpenCV would print warnings first.
+        deque(in_order(lambda i: dataset.get_data(i, image_type="uint8"), range(len(dataset))), maxlen=0)
+        forecast = duration(SECONDS * len(shapes) / num_threads())
+        CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {forecast}.")
+        views, masks, doubt = find_moving(
+            original, lambda i: points[seen_by == i],
+            progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),
+        )  # fmt: skip
+        return {
+            f"{i}": np.packbits(in_image(v, m, original, i, s) if m.any() else np.zeros(s, bool))
+            for i, (v, m, s) in enumerate(zip(views, masks, shapes, strict=True))
+        } | {"doubt": np.frombuffer(doubt.encode(), np.uint8)}
+
+    cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
+    lacks = () if has_detector() else ("people",)
+    stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points, *lacks), find)
+
+    def unpacked(i: int) -> Mask:
+        height, width = shapes[i]
+        return np.unpackbits(np.asarray(stored[f"{i}"], np.uint8), count=height * width).reshape(height, width) > 0
+
+    return Computed(len(shapes), unpacked), bytes(np.asarray(stored["doubt"], np.uint8)).decode()
+
+
+def share_of_moving(masks: Sequence[Mask]) -> str:
+    """How much of the training images moves, in one sentence."""
+    shares = np.array([mask.mean() for mask in masks])
+    if not shares.any():
+        return "Nothing is seen to move in the training images"
+    count = np.count_nonzero(shares)
+    return (
+        f"{100 * shares.mean():.1f} % of the training pixels, in {count} of {len(masks)} images, show what moves and "
+        "are masked"
+    )
+
+
+def draw_moving(path: Path, images: Iterable[tuple[str, NDArray[np.uint8]]], masks: Sequence[Mask]) -> None:
+    """Writes the images in which most moves, in order, with what moves in red.
+
+    Args:
+        path: file of the picture; its folder is made.
+        images: name, and blue, green and red of each image [H, W, 3].
+        masks: what moves in each image [H, W]; something in at least one.
+    """
+    shares = [float(mask.mean()) for mask in masks]
+    most = {i for i in sorted(range(len(masks)), key=lambda i: -shares[i])[:SHOWN] if shares[i] > 0}
+    tiles = []
+    for name, color, mask in ((*image, masks[i]) for i, image in enumerate(images) if i in most):
+        shown = color.copy()
+        shown[mask] = shown[mask] // 2 + np.array(RED, np.uint8)
+        height = round(WIDTH * color.shape[0] / color.shape[1])
+        tile = np.asarray(cv2.resize(shown, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
+        cv2.putText(tile, name, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 255, 255), 1)
+        tiles.append(tile)
+    height = max(tile.shape[0] for tile in tiles)
+    tiles = [cv2.copyMakeBorder(t, 0, height - t.shape[0], 0, 0, cv2.BORDER_CONSTANT) for t in tiles]
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
+    rows = [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.vstack(rows))
+
+
+def gain_of(shot: Shot, other: Shot) -> NDArray[np.float64]:
+    """What the blue, green and red of another shot are multiplied by for the exposure of this one, by what both show
+    at one depth. [3]"""
+    rows, columns = np.nonzero(shot.depth.inverse)
+    some = np.s_[:: max(1, len(rows) // SAMPLES)]
+    rows, columns = rows[some], columns[some]
+    parallax, inverse = Parallax.between(shot.view, other.view), shot.depth.inverse[rows, columns]
+    right, down, ahead = parallax.linear @ [columns + 0.5, rows + 0.5, np.ones(len(rows))] + np.outer(
+        parallax.b, inverse
+    )
+    ahead = np.where(ahead > 0, ahead, np.nan)
+    x, y = right / ahead, down / ahead
+    theirs = look_up(other.depth.inverse, x, y, nearest=True)
+    same = np.abs(theirs * ahead - inverse) < 0.05 * inverse
+    if np.count_nonzero(same) < ENOUGH:
+        return np.ones(3)
+    theirs = look_up(other.color, x[same], y[same])
+    mine, theirs = (np.log(c + 2.0) for c in (shot.color[rows[same], columns[same]], theirs))
+    return np.exp(np.median(mine - theirs, 0))
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What an image shows."""
+
+    gains: list[NDArray[np.float64]]
+    """Of its neighbours. [3] each"""
+    swept: Sweep
+    levels: NDArray[np.int16]
+    """Of ``seeds``. [h, w]"""
+    walkers: Mask
+    """People alone. [h, w]"""
+    shown: Evidence
+    core: Mask
+    """What moves for certain, of which objects grow. [h, w]"""
+
+
+def _others(
+    shots: Sequence[Shot], near: Sequence[int], i: int, gains: Sequence[NDArray[np.float64]]
+) -> list[Neighbour]:
+    """The neighbours of an image, at its exposure."""
+    return [Neighbour.of(shots[i], shots[j], gain) for j, gain in zip(near, gains, strict=True)]
+
+
+def _moves(
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], uprights: Mask, first: _Look | None
+) -> tuple[Mask, _Look]:
+    """What an image itself shows to move, if it is known what moves in others and where it shows people of theirs."""
+    shot = shots[i]
+    gains = first.gains if first else [gain_of(shot, shots[j]) for j in near]
+    others = _others(shots, near, i, gains)
+    swept = first.swept if first else sweep(shot, others)
+    levels = first.levels if first else np.full(uprights.shape, UNASKED, np.int16)
+    shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
+    walkers = first.walkers if first else np.zeros_like(uprights)
+    if first is None and len(shot.people.boxes):
+        walkers = grown(shot, shown, walkers)
+    core = uprights | (swept.certain & ~is_static(shot, shown))
+    if len(others) >= 2:
+        core |= seeds(shot, others, shown, levels)
+    return grown(shot, shown, core), _Look(gains, swept, levels, walkers, shown, core)
+
+
+def _followed_on(
+    shots: Sequence[Shot],
+    near: Sequence[Sequence[int]],
+    masks: list[Mask],
+    looks: dict[int, _Look],
+    pool: ThreadPoolExecutor,
+) -> list[Mask]:
+    """Masks [h, w] with what is followed from them to the images that were looked at again: by optical flow and along
+    the path, and on along it from image to image where objects enter or leave images at the side. What is followed
+    joins the seeds in ``looks``."""
+
+    def followed_to(part: Iterable[int], some_of: Callable[[int], Mask]) -> list[Mask]:
+        def whole(i: int) -> Mask:
+            shot, look = shots[i], looks[i]
+            some = some_of(i) & ~is_static(shot, look.shown)
+            if not (some & ~masks[i]).any():
+                return masks[i]
+            looks[i] = replace(look, core=look.core | some)
+            return masks[i] | grown(shot, look.shown, looks[i].core)
+
+        arrived = dict(zip(part, pool.map(whole, part), strict=True))
+        return [arrived.get(i, mask) for i, mask in enumerate(masks)]
+
+    def by_flow(i: int) -> Mask:
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        flow.setVariationalRefinementIterations(0)
+        result = np.zeros_like(masks[i])
+        for j in near[i][:AFTER]:
+            if masks[j].any():
+                result |= followed(shots[i], shots[j], masks[j], flow)
+        return result
+
+    def along_path(i: int) -> Carried:
+        others = _others(shots, near[i], i, looks[i].gains)
+        return carried(shots[i], others, [masks[j] for j in near[i]], masks[i])
+
+    def everywhere(i: int) -> Mask:
+        carry = along_path(i)
+        return by_flow(i) | carry.pixels | carry.objects | (uprights[i] & ~touching(uprights[i], masks[i]))
+
+    uprights = upright_objects(shots, near, masks, pool)
+    before, masks = masks, followed_to(looks, everywhere)
+    for _ in range(FURTHER):
+        aside = [reaches_side(mask & ~old) for mask, old in zip(masks, before, strict=True)]
+        part, before = [i for i in looks if any(aside[j] for j in near[i][:AFTER])], masks
+        masks = followed_to(part, lambda i: along_path(i).objects)
+    return masks
+
+
+def _outlined(
+    shots: Sequence[Shot],
+    near: Sequence[Sequence[int]],
+    masks: Sequence[Mask],
+    looks: dict[int, _Look],
+    pool: ThreadPoolExecutor,
+) -> list[Mask]:
+    """Masks [h, w] with better outlines, in the images that were looked at again."""
+
+    def outline(i: int) -> Mask:
+        others = _others(shots, near[i], i, looks[i].gains)
+        return outlined(shots[i], others, [masks[j] for j in near[i]], masks[i], looks[i].core, looks[i].shown.noise)
+
+    part = [i for i in looks if masks[i].any()]
+    better = dict(zip(part, pool.map(outline, part), strict=True))
+    return [better.get(i, mask) for i, mask in enumerate(masks)]

@@ -1,0 +1,210 @@
+"""Rays of new views: from positions between two training cameras that see the same point.
+
+A point that two images show with the same colour and depth is visible from everywhere between their cameras, unless an
+object between them hides it. Its colour there lies between those of the two images. Such rays supervise the colour of a
+new view and, since they end at the point, the empty space in front of it, which removes floaters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from nerfstudio.cameras.rays import RayBundle
+from numpy import ndarray
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.rays import Rays
+from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.host import give_back_freed_memory
+from mmpi_ns.utils.parallel import in_order
+from mmpi_priors.cache import held
+from mmpi_priors.dense import TRIMMED
+from mmpi_priors.known_depth import KnownDepth
+from mmpi_priors.tracks import PosedImages
+from mmpi_priors.views import look_up, project
+
+NEIGHBOURS = 4
+"""Number of cameras, the nearest facing the same way, in which a point of an image is searched."""
+MAX_ANGLE = 60.0
+"""Maximum angle in degrees between the viewing directions of two cameras with new views between them."""
+CERTAIN = 0.03
+"""Maximum relative error of a depth used for new views."""
+SAME_DEPTH = 0.03
+"""Maximum relative difference between the distances of a point in two images."""
+SAME_COLOR = 24
+"""Tolerance, in levels, beyond the range of colours within a pixel of the projection in the other image."""
+BYTES_OF_IMAGE = 18
+"""Of a pixel of an image with the range of colours around, its mask and depths."""
+MOST = 2_000_000
+"""Maximum number of pixel pairs (30 bytes each), spread over the images."""
+
+
+@dataclass(frozen=True)
+class SharedPoints:
+    """Points that two training images show at the same depth, each as a pixel of the first."""
+
+    pixels: Int[Tensor, "P 3"]
+    """Image, row and column in the first."""
+    other: Int[Tensor, "P"]
+    """The second image."""
+    colors: UInt8[Tensor, "P 2 C"]
+    """Colour in the first and the second image."""
+    depths: Float[Tensor, "P 2"]
+    """Inverse distance from the first camera, and its expected error."""
+    centers: Float[Tensor, "M 3"]
+    """Positions of all training cameras."""
+    cover: float
+    """Number of points divided by the number of pixels; limits how often each point is drawn."""
+
+    def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
+        """The points shared by two of the given images; None if there is none."""
+        images, names = images.to(self.pixels), ("pixels", "other", "colors", "depths")
+        shared = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
+        return replace(self, **{name: getattr(self, name)[shared] for name in names}) if len(shared) else None
+
+    def draw(
+        self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
+    ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
+        """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
+
+        Colours are divided by the ``exposures`` of all training images; None: they are equal.
+        """
+        device = self.pixels.device
+        chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
+        share = torch.rand(count, 1, generator=g, device=g.device).to(device)
+        first = rays(self.pixels[chosen].long())
+        depths, colors = self.depths[chosen], self.colors[chosen].float() / 255
+        if exposures is not None:
+            images = torch.stack([self.pixels[chosen, 0], self.other[chosen]], -1).long()
+            colors[..., :3] /= exposures[images]
+        origins = torch.lerp(first.origins, self.centers[self.other[chosen].long()], share)
+        # Relative to the first camera, so that the direction of distant points stays exact.
+        offsets = (first.origins - origins) * depths[:, :1] + first.directions
+        length = offsets.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        bundle = RayBundle(origins, offsets / length, torch.ones_like(share), camera_indices=first.camera_indices)
+        # The error of a distance along the ray is about that from the first camera.
+        return bundle, torch.lerp(colors[:, 0], colors[:, 1], share), depths / torch.cat([length, length**2], -1)
+
+
+@dataclass(frozen=True)
+class ShownImage:
+    """An image prepared for comparison with others."""
+
+    image: UInt8[ndarray, "H W C"]
+    darkest: UInt8[ndarray, "H W C"]
+    """Of the pixels around,"""
+    brightest: UInt8[ndarray, "H W C"]
+    """and the brightest."""
+    usable: UInt8[ndarray, "H W"]
+    depth: Float[ndarray, "H W 2"]
+
+    @staticmethod
+    def of(image: UInt8[ndarray, "H W C"], usable: UInt8[ndarray, "H W"], depth: Float[ndarray, "H W 2"]) -> ShownImage:
+        around = np.ones((3, 3), np.uint8)
+        darkest, brightest = (np.asarray(bound(image, around), np.uint8) for bound in (cv2.erode, cv2.dilate))
+        return ShownImage(image, darkest, brightest, usable, depth)
+
+    def shows(
+        self, posed: PosedImages, j: int, points: Float[ndarray, "P 3"], colors: Float[ndarray, "P C"]
+    ) -> tuple[Int[ndarray, "S"], UInt8[ndarray, "S C"]]:
+        """Numbers and colours of the points that image j, this one, shows at their distance, coloured alike."""
+        at = project(posed, j, points)
+        maps = self.depth[..., 0], self.usable, self.darkest, self.brightest
+        inverse, may, darkest, brightest = (look_up(m, *at.T, nearest=True) for m in maps)
+        expected = 1 / np.maximum(np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1), 1e-12)
+        same_depth = (inverse > 0) & (np.abs(inverse - expected) < SAME_DEPTH * expected)
+        low, high = darkest.astype(int) - SAME_COLOR, brightest.astype(int) + SAME_COLOR
+        seen = np.nonzero(same_depth & ((colors >= low) & (colors <= high)).all(-1) & (may > 0))[0]
+        return seen, look_up(self.image, *at[seen].T)
+
+
+def find_shared_points(
+    dataset: MMPIDataset,
+    posed: PosedImages,
+    depths: KnownDepth,
+    rays: Rays,
+    images: Sequence[int],
+    seed: int,
+    device: str | torch.device = "cpu",
+    exposures: Float[Tensor, "M 3"] | None = None,
+) -> SharedPoints | None:
+    """The points that two of the training ``images``, by number, show at the same depth; None if there are none.
+
+    ``seed`` chooses among more than ``MOST`` pixels. ``exposures`` are those of all training images, by which colours
+    are divided; None: they are equal. Raises InputError naming an image or mask that cannot be used.
+    """
+    # Neighbours mostly stand side by side.
+    show = held(
+        lambda i: ShownImage.of(*image_and_mask(dataset, i), depths.image(i)),
+        posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1,
+    )  # fmt: skip
+    budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
+    parts, matches = [], 0.0
+    shared = in_order(lambda i: _matches(i, images, show, posed, rays, budget, seed, exposures), images)
+    for n, (some, number) in enumerate(shared):
+        parts, matches = parts + some, matches + number
+        if n % TRIMMED == 0:
+            give_back_freed_memory()
+    if matches == 0:
+        return None
+    joined = (torch.cat(column).to(device) for column in zip(*parts, strict=True))
+    centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float().to(device)
+    cover = matches / sum(depths.codes[i][..., 0].size for i in images)
+    return SharedPoints(*joined, centers=centers, cover=cover)
+
+
+def _matches(
+    i: int,
+    images: Sequence[int],
+    show: Callable[[int], ShownImage],
+    posed: PosedImages,
+    rays: Rays,
+    most: int,
+    seed: int,
+    exposures: Float[Tensor, "M 3"] | None,
+) -> tuple[list[tuple[Tensor, ...]], float]:
+    """Points that image i shares with its neighbours among others, each as the first four fields of ``SharedPoints``.
+
+    Its pixels of certain depth are compared, ``most`` at most; second comes the number of matches that all would have.
+    """
+    shown = show(i)
+    inverse, error = shown.depth[..., 0], shown.depth[..., 1]
+    rows, columns = np.nonzero((inverse > 0) & (error < CERTAIN * inverse) & (shown.usable > 0))
+    count, parts, matches = len(rows), [], 0.0
+    if count > most:
+        chosen = np.sort(np.random.default_rng((seed, i)).choice(count, most, replace=False))
+        rows, columns = rows[chosen], columns[chosen]
+    if not count:
+        return parts, matches
+    pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
+    depths, colors = shown.depth[rows, columns], shown.image[rows, columns]
+    directions = rays(pixels).directions.double().cpu().numpy()
+    points = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1]
+    for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):
+        expected = colors.astype(np.float32)
+        if exposures is not None:
+            expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
+        seen, theirs = show(j).shows(posed, j, points, expected.clip(0, 255))
+        matches += len(seen) * count / len(rows)
+        other, both = torch.full((len(seen),), j, dtype=torch.int32), np.stack([colors[seen], theirs], 1)
+        parts.append((pixels[seen].int(), other, torch.from_numpy(both), torch.from_numpy(depths[seen])))
+    return parts, matches
+
+
+def image_and_mask(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Colours of an image [H, W, C] and where it may be used [H, W]."""
+    data = dataset.get_data(i, image_type="uint8")
+    image = data["image"].numpy()
+    usable = np.ones(image.shape[:2], np.uint8) if "mask" not in data else data["mask"][..., 0].numpy().astype(np.uint8)
+    if image.shape[-1] == 4:
+        usable &= image[..., 3] == 255
+    elif dataset.has_alpha:
+        image = np.concatenate([image, np.full_like(image[..., :1], 255)], -1)
+    return image, usable

@@ -1,0 +1,228 @@
+"""Images with poses, and tracks triangulated from their features by pycolmap if a scene has none.
+
+Poses and intrinsics are kept fixed. The result is what a COLMAP model would contain: points, and their keypoints in the
+training images. Placement uses them to locate content, and training to supervise depth.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.files import opened
+from mmpi_priors import sfm
+from mmpi_priors.sfm import SfmModel, load_pycolmap, read_reconstruction
+
+NEIGHBOURS = 8
+"""Maximum number of images that each image is matched with: the nearest with a similar viewing direction."""
+SMALL, LARGE = 800, 1600
+"""Images up to the first size are doubled to find fine features; images above the second are reduced to it."""
+SAME_PLACE = 1e-6
+"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
+MAX_ANGLE = 60.0
+"""Maximum angle in degrees between the viewing directions of matched images."""
+MIN_TRACK = 2
+"""Minimum number of images of a point; with given poses, two are enough."""
+COPIES = re.compile(r"(.+)_(\d+)")
+"""Name of a folder of downscaled copies: that of the originals, and the factor."""
+EFFORTS = ((0.0067, False, 15), (0.002, True, 8))
+"""Contrast of the faintest features (SIFT), whether a pair is matched again along the epipolar lines of its first
+matches, and its least inliers: for textured images, and for rooms at low resolution (two to four times slower)."""
+FORMATS = {"PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "BMP": ".bmp", "TIFF": ".tif"}
+"""Formats that pycolmap reads, as Pillow calls them, and their endings."""
+ENOUGH = 100
+"""Average number of keypoints in an image above which the thorough search is skipped."""
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """Images and their cameras."""
+
+    files: tuple[Path, ...]
+    camera_to_worlds: NDArray[np.float64]
+    """[M, 3, 4], OpenGL axes."""
+    intrinsics: NDArray[np.float64]
+    """[M, 4]: fx, fy, cx, cy in pixels."""
+    sizes: NDArray[np.float64]
+    """[M, 2]: width, height in pixels."""
+    distortion: NDArray[np.float64]
+    """[M, 4]: k1, k2, p1, p2 (OpenCV), or k1 to k4 of a fisheye lens."""
+    fisheye: NDArray[np.bool_] | bool = False
+    """Whether the lens of each image is a fisheye: [M], or one for all."""
+
+    def is_fisheye(self, i: int) -> bool:
+        """Whether image i has a fisheye lens."""
+        return bool(np.broadcast_to(self.fisheye, len(self.sizes))[i])
+
+    def is_bent(self, i: int) -> bool:
+        """True if the lens of image i is not a pinhole's; a fisheye never is, even if all its terms are 0."""
+        return self.is_fisheye(i) or bool(self.distortion[i].any())
+
+
+def original_of(file: Path) -> tuple[Path, int]:
+    """The original of a downscaled copy (``images/x.jpg`` of ``images_2/x.jpg``) and its factor, or the file and 1."""
+    for folder in file.parents:
+        if name := COPIES.fullmatch(folder.name):
+            original = folder.parent / name[1] / file.relative_to(folder)
+            if original.is_file():
+                return original, int(name[2])
+    return file, 1
+
+
+def size_of(file: Path) -> NDArray[np.float64]:
+    """Width and height of an image file. Raises InputError if it cannot be read (names it)."""
+    with opened(file) as image:
+        return np.array(image.size, np.float64)
+
+
+def shown_size(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Width and height of a file of this size as its camera shows it, which may lack a last row or column, or be of
+    another size if files are reduced when they are read."""
+    return np.where(np.abs(size - camera) <= 1, size, camera)
+
+
+def whole_of(file: Path, size: NDArray[np.float64]) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
+    """What a downscaled copy was made from, its size, and its pixels (columns, rows) in one of the copy.
+
+    A file, of this width and height, without an original, or whose original has another shape, stands for itself.
+    Raises InputError naming an image file that cannot be read.
+    """
+    original, factor = original_of(file)
+    if factor > 1:
+        whole = size_of(original)
+        if (np.abs(whole - factor * size) <= factor).all():
+            is_cut = (factor * size < whole).any() and (factor * size <= whole).all() and _is_cut(file.parent)
+            return original, whole, np.full(2, float(factor)) if is_cut else whole / size
+    return file, size, np.ones(2)
+
+
+@lru_cache(maxsize=64)
+def _is_cut(folder: Path) -> bool:
+    """Whether downscaled copies leave out the last columns and rows of originals that are no multiple of the factor.
+
+    Other programs reduce the whole image to a size that they round. The first such copy is compared with both.
+    """
+    for file in sorted(folder.iterdir()):
+        original, factor = original_of(file)
+        if factor > 1:
+            with suppress(OSError), Image.open(original) as whole, Image.open(file) as copy:
+                width, height = copy.size
+                if (factor * width, factor * height) != whole.size:
+                    gray, shown = whole.convert("L"), np.asarray(copy.convert("L"), float)
+                    cut = gray.crop((0, 0, factor * width, factor * height)).reduce(factor)
+                    reduced = gray.resize(copy.size, Image.Resampling.BOX)
+                    errors = [np.square(np.asarray(image, float) - shown).sum() for image in (cut, reduced)]
+                    return errors[0] < errors[1]
+    return False
+
+
+def at_full_size(images: PosedImages) -> PosedImages:
+    """The same views in their originals, which are sharper; a view whose original has another shape stays as it is.
+    Raises InputError naming an image file that cannot be read."""
+    copies = [size_of(file) for file in images.files]
+    files, sizes, scales = zip(*map(whole_of, images.files, copies), strict=True)
+    reduced = np.stack(copies) / [shown_size(*pair) for pair in zip(copies, images.sizes, strict=True)]
+    intrinsics = images.intrinsics * np.tile(scales * reduced, 2)
+    return replace(images, files=files, sizes=np.stack(sizes), intrinsics=intrinsics)
+
+
+def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
+    """Pairs (i, j) with i < j, in order, of each camera, by poses [M, 3, 4], with its nearest ones that have a similar
+    viewing direction, ``neighbours`` at most."""
+    near = [
+        nearest_views(camera_to_worlds, i, neighbours, MAX_ANGLE, apart=False) for i in range(len(camera_to_worlds))
+    ]
+    return sorted({(min(i, j), max(i, j)) for i, others in enumerate(near) for j in others})
+
+
+def _gathered(files: tuple[Path, ...], folder: Path) -> list[str]:
+    """Names in a folder of images by their indices, since two of other folders may be called the same: linked, or
+    gray PNGs of formats that COLMAP does not read. Raises InputError if an image file cannot be read."""
+    names = []
+    for i, file in enumerate(files):
+        with opened(file) as image:
+            ending = FORMATS.get(str(image.format))
+            gray = None if ending else image.convert("L")
+        names.append(f"{i:06d}{ending or '.png'}")
+        if gray is None:
+            os.symlink(file.resolve(), folder / names[i])
+        else:
+            gray.save(folder / names[i], compress_level=1)
+    return names
+
+
+def triangulate(images: PosedImages) -> SfmModel:
+    """Points seen in several images, in the frame of their poses, and their keypoints; images are named by their
+    indices.
+
+    Deterministic for equal images and poses. A quick search is followed by a thorough one if it finds too little. The
+    quick search takes about a third of a second for each image on one core, the thorough one a second. Raises
+    InputError if an image file cannot be read."""
+    pycolmap, tracks, error = load_pycolmap(), None, np.nan
+    cameras = []
+    for i, (width, height) in enumerate(images.sizes.astype(int).tolist()):
+        lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
+        params = [*images.intrinsics[i], *images.distortion[i]]
+        camera = pycolmap.Camera(model=lens, width=width, height=height, params=params, camera_id=i + 1)
+        camera.has_prior_focal_length = True
+        cameras.append(camera)
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = LARGE
+    options.sift.first_octave = -1 if images.sizes.max() <= SMALL else 0
+    with sfm.quiet(), tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
+        work = Path(folder)
+        names = _gathered(images.files, work)
+        pairs = [(names[i], names[j]) for i, j in near_pairs(images.camera_to_worlds, NEIGHBOURS)]
+        opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
+        poses = dict(zip(names, map(sfm.rigid3d, opencv), strict=True))
+        for contrast, guided, least in EFFORTS:
+            if tracks is not None and len(tracks.seen_by) >= ENOUGH * len(names):
+                break
+            model, database = sfm.new_model(cameras, names, range(1, len(names) + 1), poses), work / f"{contrast}.db"
+            sfm.write_images(model, database)
+            options.sift.peak_threshold = contrast
+            sfm.find_features(database, work, names, options)
+            for file, features in zip(images.files, sfm.count_features(database), strict=True):
+                if features is None:
+                    why = "by COLMAP"
+                    raise InputError(f"Image {file} cannot be read ({why}): repair it or leave it out.")
+            if pairs:
+                sfm.match_pairs(database, pairs, guided=guided, least=least)
+                error = _epipolar_error(database, model)
+                model = sfm.triangulate_points(model, database, work, pairs_alone=True)
+            tracks = read_reconstruction(model, MIN_TRACK)
+    assert tracks is not None
+    return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
+
+
+def _epipolar_error(database: Path, model: Any) -> float:
+    """Median distance of the verified matches from the epipolar lines of a model's poses, relative to the width.
+
+    Unlike reprojection errors of points it is not truncated: matches that fit the poses badly never become points.
+    Images of one place have no epipolar lines; NaN without others.
+    """
+    pycolmap, distances = load_pycolmap(), []
+    cameras = {i: model.cameras[image.camera_id] for i, image in model.images.items()}
+    with pycolmap.Database.open(database) as opened:
+        keypoints = {i: np.asarray(opened.read_keypoints(i), np.float64).reshape(-1, 6)[:, :2] for i in model.images}
+    rays = {i: np.asarray(cameras[i].cam_from_img(points)) for i, points in keypoints.items()}
+    centers = {i: image.projection_center() for i, image in model.images.items()}
+    least = SAME_PLACE * max(1.0, float(np.abs(list(centers.values())).max()))
+    for a, b, matches in sfm.verified_matches(database):
+        if np.linalg.norm(centers[a] - centers[b]) <= least:
+            continue
+        distance = sfm.epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
+        distances.append(distance * cameras[a].mean_focal_length() / cameras[a].width)
+    return float(np.median(np.concatenate(distances))) if sum(map(len, distances)) else np.nan

@@ -1,0 +1,1 @@
+"""Baked scenes: the web page that plays them, splats, and their renderer."""
