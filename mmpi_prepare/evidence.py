@@ -105,7 +105,10 @@ class Agreement:
 
 def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
     """The evidence on a mapper's model, which has the keypoints of the database; ``offered`` are the names of all
-    images of the capture in order."""
+    images of the capture in order.
+
+    A lens has no ray for a pixel beyond its largest image radius (COLMAP returns NaN): matches there fit nothing.
+    """
     names, poses = camera_poses(model)
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
     points = {  # the point that each keypoint sees, -1 for none
@@ -117,10 +120,11 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         pixels = np.array([p.xy for p in image.points2D], dtype=np.float64).reshape(-1, 2)
         rays[image.image_id] = np.asarray(model.cameras[image.camera_id].cam_from_img(pixels)).reshape(-1, 2)
         seen = points[image.image_id]
-        directions = np.c_[rays[image.image_id], np.ones(len(seen))][seen >= 0] @ pose[:3, :3].T
+        certain = (seen >= 0) & np.isfinite(rays[image.image_id]).all(-1)
+        directions = np.c_[rays[image.image_id], np.ones(len(seen))][certain] @ pose[:3, :3].T
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         center = np.tile(pose[:3, 3], (len(directions), 1))
-        observations.append((seen[seen >= 0], np.full(len(directions), n), center, directions))
+        observations.append((seen[certain], np.full(len(directions), n), center, directions))
     points_seen, frames, centers, directions = (np.concatenate(column) for column in zip(*observations, strict=True))
     place, rows = {image.image_id: n for n, image in enumerate(images)}, []  # of pairs of registered images
     matched, fits = [], []
@@ -131,10 +135,12 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         tracked = (points[a][left] == points[b][right]) & (points[a][left] >= 0)
         camera = model.cameras[model.images[a].camera_id]
         fit = FIT_PX * max(camera.width, camera.height) / 1000 / camera.mean_focal_length()
-        distance = epipolar_distances(model, a, b, (rays[a][left], rays[b][right])) / fit
+        finite = np.isfinite(np.c_[rays[a][left], rays[b][right]]).all(-1)  # the others fit nothing
+        matched_rays = rays[a][left][finite], rays[b][right][finite]
+        distance = epipolar_distances(model, a, b, matched_rays) / fit
         fitting, beside = int((distance < 1).sum()), int(((distance >= 1) & (distance < BESIDE)).sum())
         rows.append((place[a], place[b], len(left), int(tracked.sum()), fitting, beside))
-        matched.append((rays[a][left], rays[b][right]))
+        matched.append(matched_rays)
         fits.append(fit)
     table = np.array(rows, dtype=np.int64).reshape(-1, 6)
     low, high = table[:, :2].min(1, initial=len(place)), table[:, :2].max(1, initial=0)
@@ -159,9 +165,15 @@ def turns_explain(matched: Sequence[tuple[Array, Array]], fits: Sequence[float])
     Args:
         matched: matched keypoints of each pair, in the plane z = 1 of either camera. [M, 2] each
         fits: distance there up to which a match of the pair is explained.
+
+    Matches that are not finite are left out, and pairs of fewer than ``MIN_INLIERS`` others.
     """
-    step = max(1, len(matched) // TRIED)
-    tried = list(zip(matched[::step], fits[::step], strict=True))
+    sound = []
+    for (first, second), fit in zip(matched, fits, strict=True):
+        finite = np.isfinite(np.c_[first, second]).all(-1)
+        if finite.sum() >= MIN_INLIERS:
+            sound.append(((first[finite], second[finite]), fit))
+    tried = sound[:: max(1, len(sound) // TRIED)]
     if not tried:
         return False
 

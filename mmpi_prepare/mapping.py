@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pycolmap
 
-from mmpi_ns.utils.errors import InputError, progress, say
+from mmpi_ns.utils.errors import InputError, brief, progress, say
 from mmpi_prepare.adjustment import STILL, is_bent, open_focals, polish, quality, with_all_points, with_focals
 from mmpi_prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_prepare.features import matching_pairs
@@ -257,6 +257,15 @@ def map_globally(
     return largest and largest[0]
 
 
+def _evidence(name: str, says: str, model: pycolmap.Reconstruction, task: Task) -> Witness | None:
+    """The evidence on one candidate model; None, with the reason said, where it has none."""
+    try:
+        return witness_of(name, says, model, task.database, task.offered)
+    except (ArithmeticError, ValueError, RuntimeError) as error:  # numpy's LinAlgError is a ValueError
+        say(f"Mapping, {name}: left out, its model cannot be judged ({brief(error)}).", "yellow")
+        return None
+
+
 def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
     """Runs the global mapper, then the incremental one from the focal length that fits, and chooses by the evidence.
 
@@ -273,12 +282,13 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
     noted = open_focals(model, task.database, task.threads) if task.lens else {}
     if noted:
         model, *rest = (with_focals(m, noted, task.threads) for m in (model, *(w.model for w in others)))
-        others = [witness_of(w.name, w.says, m, task.database, task.offered) for w, m in zip(others, rest, strict=True)]
+        judged = (_evidence(w.name, w.says, m, task) for w, m in zip(others, rest, strict=True))
+        others = [witness for witness in judged if witness is not None]
     else:
         model = polish(model, task.threads, task.lens, task.full_lens, task.principal_point)
-    polished = witness_of(chosen.name, chosen.says, model, task.database, task.offered)
-    before, after = (ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished))
-    if after > before:
+    polished = _evidence(chosen.name, chosen.says, model, task)
+    grades = [ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished) if w is not None]
+    if polished is None or grades[1] > grades[0]:
         say("The final bundle adjustment makes the evidence worse: left out.", "yellow")
     else:
         chosen = polished
@@ -307,14 +317,17 @@ def _candidates(task: Task) -> list[Witness]:
     try:
         start = _start_from(task, "from-global", focals)
         model, says = reconstruct(task, start, attempts)
-        candidates.append(witness_of("incremental", says, model, task.database, task.offered))
+        witness = _evidence("incremental", says, model, task)
+        candidates += [witness] if witness is not None else []
     except InputError as error:
         failed = error
     large = [w for w in candidates if len(w.images) >= NEARLY_ALL * len(task.offered)]
     if is_part and not any(judge_alone(w, task.is_ordered).grade == "right" for w in large):
         candidates += _globally([("global-all", focals)], task.offered, task)
-    if failed and not candidates:
-        raise failed
+    if not candidates:
+        raise failed or InputError(
+            "No mapper made a model that can be judged: the lens of each is broken. Give --focal."
+        )
     return best_first(candidates, task.is_ordered)
 
 
@@ -377,7 +390,9 @@ def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[st
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
         error = model.compute_mean_reprojection_error()
         says = f"{model.num_reg_images()} of {len(names)} images, {error:.2f} px, focal length {focal} px"
-        witness = witness_of("global", f"{name} ({says})", model, task.database, task.offered)
+        witness = _evidence("global", f"{name} ({says})", model, task)
+        if witness is None:
+            continue
         if share(witness.pairs.tracked, witness.pairs.matches) < LEAST_POINTS:
             says += "; left out, as hardly any match became a point"
         else:

@@ -317,6 +317,17 @@ def test_a_camera_that_turns_in_one_place_is_told_from_one_that_moves(zoom):
     assert not turns_explain([], [])
 
 
+def test_a_pixel_without_a_ray_leaves_its_pair_and_a_pair_without_rays_the_others():
+    camera = pycolmap.Camera.create(1, pycolmap.CameraModelId.SIMPLE_RADIAL, 1000.0, 800, 1200)
+    camera.params = [1000.0, 400.0, 600.0, -0.3]
+    assert np.isnan(camera.cam_from_img(np.array([[10.0, 10.0]]))).all()
+    for shift in (0.0, 0.1):
+        pairs, fits = pairs_of_rays(shift)
+        pairs[0][1][3], pairs[4] = np.nan, (np.full((200, 2), np.nan), pairs[4][1])
+        assert turns_explain(pairs, fits) == (shift == 0.0)
+    assert not turns_explain([(np.full((200, 2), np.nan),) * 2], [2e-3])
+
+
 def test_without_parallax_a_track_is_doubtful_though_mappers_agree(sound):
     turning = replace(sound, only_turns=True)
     verdict = judge_together(turning, [replace(turning, name="global")], True)

@@ -56,6 +56,33 @@ def test_of_a_long_sequence_a_hundred_images_are_placed_first(task, count, step)
     assert replace(task, offered=names, is_ordered=False).placed == names
 
 
+def test_a_candidate_whose_lens_ends_within_its_images_is_judged(task):
+    model, says = mapping.reconstruct(task, task.database)
+    sound = mapping.witness_of("incremental", says, model, task.database, task.offered)
+    for camera in model.cameras.values():
+        size = (camera.width, camera.height)
+        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+        camera.params = [0.4 * max(size), size[0] / 2, size[1] / 2, -0.6]
+        assert np.isnan(camera.cam_from_img(np.array([[1.0, 1.0]]))).all()
+    broken = mapping.witness_of("incremental", says, model, task.database, task.offered)
+    assert np.array_equal(broken.pairs.matches, sound.pairs.matches)
+    assert broken.pairs.fitting.sum() < 0.5 * sound.pairs.fitting.sum()
+    assert not np.isinf(broken.scales).any() and not broken.only_turns
+
+
+def test_a_candidate_that_cannot_be_judged_is_left_out_with_its_reason(task, monkeypatch, capsys):
+    def witness_of(name, *rest):
+        if name == "global":
+            raise np.linalg.LinAlgError("SVD did not converge")
+        return judged(name, *rest)
+
+    judged = mapping.witness_of
+    monkeypatch.setattr(mapping, "witness_of", witness_of)
+    _, says, verdict = map_and_judge(task)
+    assert says.startswith("incremental") and verdict.grade in ("right", "doubtful")
+    assert "cannot be judged (SVD did not converge)" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_long_sequence_is_confirmed_by_a_part_of_it(task, monkeypatch):
     monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
     model, says, verdict = map_and_judge(task)
