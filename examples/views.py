@@ -74,7 +74,6 @@ def load_run(config: Path) -> Run:
     model, manager = pipeline.model, pipeline.datamanager
     if not isinstance(model, MMPIModel) or not isinstance(manager, MMPIDataManager):
         raise ValueError(f"{config} belongs to another method: give the config.yml of an mmpi run.")
-    model.config.rendering.mode = "exact"  # the figures show the field itself
     scale = float(manager.train_dataparser_outputs.dataparser_scale)
     return Run(model, manager.observations, manager.eval_dataset, scale)
 

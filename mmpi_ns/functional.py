@@ -94,7 +94,7 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
         config = read_run_config(folder / "config.yml")
         state = read_checkpoint(last_checkpoint(folder / "nerfstudio_models"))
         cameras = state["capture"]["cameras"]
-        config.windows_folder, config.rendering.mode = folder / "windows", "exact"
+        config.windows_folder = folder / "windows"
         unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
         model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
         tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}

@@ -23,7 +23,6 @@ from mmpi_ns.data.datamanager import DEPTHS_KNOWN, GAINS, OBSERVATIONS, RAYS_PER
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.layout import Shapes
 from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
@@ -41,7 +40,7 @@ from mmpi_ns.rendering.rendered import (
     shown_outputs,
     winners,
 )
-from mmpi_ns.rendering.sampler import SamplingConfig, rays_of
+from mmpi_ns.rendering.sampler import SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -54,7 +53,6 @@ from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
-from mmpi_show.windows import BakedWindow, bake, why_not_baked
 
 
 @dataclass
@@ -127,7 +125,7 @@ class MMPIModel(Model):
         self.progress = Progress(windows, schedule)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
-        self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
+        self.store = WindowStore(config.windows_folder, self._new_field, budget)
         self.exposures = Exposures(metadata.get(GAINS), None if views is None else views.origins)
         self.details: Details | None = None
         self.metrics = ImageMetrics(config.lpips_net)
@@ -180,11 +178,9 @@ class MMPIModel(Model):
         )
 
     def _take_plan(self, _: Any = None) -> None:
-        """Takes over plan and schedule, also of a checkpoint that was loaded; a GPU's kernels are compiled for them."""
-        joint, windows = self.progress.schedule.is_joint, self.progress.windows
-        self.field.shares_depth = joint
-        self.show.set_options(["all", *windows.names])
-        dispatch.expect(Shapes.of(windows.plans, blends=not joint, channels=self.config.colour.feature_channels))
+        """Takes over plan and schedule, also of a checkpoint that was loaded."""
+        self.field.shares_depth = self.progress.schedule.is_joint
+        self.show.set_options(["all", *self.progress.windows.names])
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         return self.run.parameters()
@@ -247,17 +243,9 @@ class MMPIModel(Model):
     ) -> dict[str, Tensor]:
         """``image_outputs`` of one window, by its number and field; winning MPIs are counted through all windows.
         ``chosen``: the one (window, head) to show; None for all."""
-        mode, first_head = self.config.rendering.mode, sum(p.num_heads for p in self.progress.windows.plans[:window])
+        first_head = sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
-        one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
-        is_quick = dispatch.form_of("show_baked", field.features.data) == "cpu" and not torch.is_grad_enabled()
-        may_bake = mode == "auto" and is_quick and not self.trains and one_exposure and self.scoring is None
         bundle = bounded(bundle, field.plan)
-        if chosen is None and (mode == "baked" or (may_bake and not why_not_baked(field))):
-            rays = rays_of(bundle)
-            bounds = rays.nears, rays.fars
-            outputs = self.baked(field).render(rays.origins, rays.directions, bounds, background)
-            return outputs | winners(outputs, bundle, field, first_head)
         blends, head_mask = self.blends(field), None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
@@ -273,16 +261,6 @@ class MMPIModel(Model):
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1)}
         radiance = outputs["rgb"] + behind / exposure
         return outputs | {"rgb": (exposure * radiance).clamp(0, 1), "radiance": radiance}
-
-    def baked(self, field: MMPIField) -> BakedWindow:
-        """Baked form of a field, cached until the field is trained on. Raises ValueError if it cannot be baked."""
-        if (window := field.cached("baked")) is not None:
-            return window
-        say("Baking, once: a few seconds.")
-        rendering, mean = self.config.rendering, self.exposures.mean
-        exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
-        shown = (rendering.threshold, BACKGROUNDS[rendering.background], self.blends(field), exposure)
-        return field.cached("baked", lambda: bake(field, *shown))
 
     def blends(self, field: MMPIField) -> bool:
         """Whether reliability enters a field's pictures."""

@@ -30,13 +30,12 @@ from mmpi_priors.cache import Arrays, Computed, digest, remembered
 from mmpi_priors.dense import Depth, Progress, find_depths
 from mmpi_priors.moving_carry import Carried, carried
 from mmpi_priors.moving_doubt import doubt_of
-from mmpi_priors.moving_evidence import Evidence, Mask, Neighbour, Shot, evidence, ground_of
+from mmpi_priors.moving_evidence import Evidence, Mask, Neighbour, Shot, evidence, ground_of, horizon_of
 from mmpi_priors.moving_follow import upright_objects
 from mmpi_priors.moving_objects import UNASKED, followed, grown, is_static, seeds, touching
 from mmpi_priors.moving_outline import outlined
 from mmpi_priors.moving_sweep import Sweep, sweep
 from mmpi_priors.observe import posed_images
-from mmpi_priors.people import has_detector, horizon_of, people_in
 from mmpi_priors.tracks import PosedImages, at_full_size
 from mmpi_priors.upright import upright
 from mmpi_priors.views import Parallax, View, look_up, project, straightened, straightened_color
@@ -59,14 +58,12 @@ EDGE = 0.4
 SECONDS = 0.35
 """Processor seconds for an image, for the forecast (docs/moving.md)."""
 LARGE = 0.015
-"""Share of an image that must be masked in one of them, or nothing is but people,"""
-WALKERS = 4
-"""if they are found in so many images: in a few the detector may take a thing for a person."""
+"""Share of an image that must be masked in one of them, or nothing is."""
 COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 20
+VERSION = 21
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -104,7 +101,6 @@ def find_moving(
     nothing, first = masks.copy(), {}
 
     def look(i: int) -> tuple[Mask, _Look]:
-        shots[i] = replace(shots[i], people=people_in(images, i, shots[i].view, up))
         return _moves(shots, near[i], i, nothing, nothing[i], None)
 
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
@@ -124,9 +120,8 @@ def find_moving(
         # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
         if max((mask.mean() for mask in masks), default=0.0) >= LARGE:
             masks = _outlined(shots, near, masks, looks, pool)
-        else:  # walkers may stay away
-            walkers = {i: seen.walkers for i, seen in first.items() if seen.walkers.any()}
-            masks = [walkers[i] if i in walkers and len(walkers) >= WALKERS else nothing[i] for i in range(len(masks))]
+        else:
+            masks = nothing
     return [shot.view for shot in shots], masks, doubt_of(shots, up, masks)
 
 
@@ -200,8 +195,7 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> tuple[Sequ
         } | {"doubt": np.frombuffer(doubt.encode(), np.uint8)}
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    lacks = () if has_detector() else ("people",)
-    stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points, *lacks), find)
+    stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points), find)
 
     def unpacked(i: int) -> Mask:
         height, width = shapes[i]
@@ -278,8 +272,6 @@ class _Look:
     swept: Sweep
     levels: NDArray[np.int16]
     """Of ``seeds``. [h, w]"""
-    walkers: Mask
-    """People alone. [h, w]"""
     shown: Evidence
     core: Mask
     """What moves for certain, of which objects grow. [h, w]"""
@@ -295,20 +287,17 @@ def _others(
 def _moves(
     shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], uprights: Mask, first: _Look | None
 ) -> tuple[Mask, _Look]:
-    """What an image itself shows to move, if it is known what moves in others and where it shows people of theirs."""
+    """What an image itself shows to move, given what moves in others and where it shows objects of theirs."""
     shot = shots[i]
     gains = first.gains if first else [gain_of(shot, shots[j]) for j in near]
     others = _others(shots, near, i, gains)
     swept = first.swept if first else sweep(shot, others)
     levels = first.levels if first else np.full(uprights.shape, UNASKED, np.int16)
     shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
-    walkers = first.walkers if first else np.zeros_like(uprights)
-    if first is None and len(shot.people.boxes):
-        walkers = grown(shot, shown, walkers)
     core = uprights | (swept.certain & ~is_static(shot, shown))
     if len(others) >= 2:
         core |= seeds(shot, others, shown, levels)
-    return grown(shot, shown, core), _Look(gains, swept, levels, walkers, shown, core)
+    return grown(shot, shown, core), _Look(gains, swept, levels, shown, core)
 
 
 def _followed_on(

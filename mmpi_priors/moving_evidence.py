@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_priors.dense import Depth
-from mmpi_priors.people import NOBODY, People
 from mmpi_priors.views import Map, Parallax, View, pixel_grid
 
 Bytes = NDArray[np.uint8]
@@ -62,8 +61,6 @@ class Shot:
     """Inverse depth of the ground, 0 near the horizon and above; None where no ground is found. [h, w]"""
     horizon: NDArray[np.float64] | None = None
     """Row of the horizon in each column, where a ground is found. [w]"""
-    people: People = NOBODY
-    """What looks like people."""
     level: NDArray[np.float64] | None = None
     """The horizon also where no ground is found; None where the camera looks steeply up or down. [w]"""
 
@@ -95,6 +92,16 @@ class Evidence:
 def turned(view: View, other: View) -> bool:
     """Whether the camera turned between two images."""
     return float(view.pose[:, 2] @ other.pose[:, 2]) < np.cos(np.radians(TURNED))
+
+
+def horizon_of(view: View, up: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Row of the horizon in each column of a view [w]; None where it looks steeply up or down."""
+    fx, fy, cx, cy = view.pinhole
+    right, down, ahead = np.array([1, -1, -1]) * (view.pose[:, :3].T @ up)
+    if abs(down) < 0.5:
+        return None
+    x = (np.arange(view.gray.shape[1]) + 0.5 - cx) / fx
+    return cy - fy * (right * x + ahead) / down
 
 
 def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:

@@ -59,9 +59,6 @@ gap between is its width over twice the second, at most; and rows below it over 
 it to be cut off there."""
 CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
-SURE, SEEN, STATIC = 0.6, 0.25, 0.5
-"""Score of the detector above which what looks like a person is one; below it, the share of pixels that must be seen to
-move; and the share of static pixels from which it is none."""
 STANDS = 0.1
 """Share of an object that lies below the height of the camera, at least: what moves stands on the ground, and branches,
 chimneys and towers in front of the sky look like movers where few images show them from far apart."""
@@ -128,7 +125,7 @@ def is_static(shot: Shot, evidence: Evidence) -> Mask:
 
 
 def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
-    """The objects that seeds lie on, and people, by GrabCut in a box around them. [h, w]"""
+    """The objects that seeds lie on, by GrabCut in a box around them. [h, w]"""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (TOGETHER, TOGETHER))
     number, labels = cv2.connectedComponents(cv2.dilate(core.astype(np.uint8), kernel))
     static = is_static(shot, evidence)
@@ -142,13 +139,6 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
         whole = _object(shot, part, evidence.judged, static, room, body)
         if shot.level is None or (whole & (np.arange(len(part))[:, None] > shot.level)).sum() > STANDS * whole.sum():
             result |= whole
-    for (left, top, right, bottom), score in zip(shot.people.boxes, shot.people.scores, strict=True):
-        # What a person surely covers: the third in the middle.
-        body, third = np.zeros_like(core), (right - left) // 3
-        body[max(0, top) : bottom, max(0, left + third) : right - third] = True
-        moves = body.any() and (score > SURE or (evidence.strong[body] > CERTAIN).mean() > SEEN)
-        if moves and static[body].mean() < STATIC:
-            result |= _object(shot, body, evidence.judged, static, (left, top, right, bottom), top)
     return result
 
 

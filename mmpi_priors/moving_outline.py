@@ -37,7 +37,7 @@ def outlined(
         others: its neighbours.
         masks: what moves in each. [h, w]
         mask: what moves in the shot. [h, w]
-        core: seeds, which stay; so do objects without any, which are people. [h, w]
+        core: seeds, which stay; so do objects without any. [h, w]
         noise: levels by which surfaces differ from what explains them.
     """
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))

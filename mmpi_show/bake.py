@@ -18,8 +18,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.data.rays import image_rays
+from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.rendering.metrics import ImageMetrics, psnr
+from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.training.options import check_nothing_left
 from mmpi_ns.utils.errors import InputError, brief
@@ -28,7 +30,7 @@ from mmpi_show.codes import smoothed_codes
 from mmpi_show.details import stored_view
 from mmpi_show.files import BakedScene, Pose
 from mmpi_show.scene import most_of_copies, neighbours
-from mmpi_show.windows import BakedWindow
+from mmpi_show.windows import BakedWindow, bake
 
 SLACK = 0.01
 """What a texel's colours and features may be off by (before sigmoid and tanh), times the largest weight with which a
@@ -58,10 +60,16 @@ def load_model(load_config: Path, details: bool = False) -> Any:
     read_run_config(load_config)
     _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
     assert isinstance(pipeline.model, MMPIModel)
-    pipeline.model.config.rendering.mode = "exact"  # the exact renderer is the reference
     if not details:
         pipeline.model.details = None
     return pipeline
+
+
+def bake_of_model(model: MMPIModel, field: MMPIField) -> BakedWindow:
+    """A window of a model, as its images show it. Raises ValueError if it cannot be baked (says why)."""
+    rendering, mean = model.config.rendering, model.exposures.mean
+    exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
+    return bake(field, rendering.threshold, BACKGROUNDS[rendering.background], model.blends(field), exposure)
 
 
 @torch_apart()
@@ -88,7 +96,7 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
-        whole = model.baked(field)
+        whole = bake_of_model(model, field)
         cameras_here = (shares[:, number] > 0).nonzero()[:, 0].tolist()
         step = math.ceil((float((cameras.width * cameras.height)[cameras_here].sum()) / MOST_LOOKED_AT) ** 0.5)
         alike = sorted(cameras_here, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])

@@ -59,7 +59,6 @@ def test_images_of_a_run_are_those_of_ns_eval(which, request):
     config = request.getfixturevalue(which)
     scene = mmpi_ns.load(config, device="cpu")
     _, pipeline, _, _ = eval_setup(config)
-    pipeline.model.config.rendering.mode = "exact"
     assert scene.mpis == pipeline.model.progress.windows.names
     cameras = pipeline.datamanager.eval_dataset.cameras
     for i in range(len(cameras)):

@@ -26,13 +26,14 @@ from itertools import accumulate
 from operator import mul
 from pathlib import Path
 
+import kernel_cases
 import torch
 import triton
+from kernel_cases import SMALL, Shapes
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from mmpi_ns.ops import dispatch, trial
-from mmpi_ns.ops.layout import SMALL, Shapes
+from mmpi_ns.ops import dispatch
 
 ARCHITECTURES = (75, 80, 86, 89, 90)
 """Turing, Ampere (A100), Ampere (RTX 30), Ada, Hopper."""
@@ -120,21 +121,21 @@ def launches_noted(noted):
 
 
 def all_launches(setattr, shapes=SMALL):
-    """Every kernel launched as on a GPU, with the arguments of the trials.
+    """Every kernel launched as on a GPU, with toy arguments.
 
     Args:
-        shapes: of the trials.
+        shapes: of the toy scenes.
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
     setattr(dispatch, "interpreting", True)
     setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.operations()]))
     with launches_noted({}) as noted:
-        for name, cases in trial.CASES.items():
+        for name, cases in kernel_cases.CASES.items():
             module = importlib.import_module(f"{dispatch.operations()[name].__module__}.gpu")
             if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
                 setattr(module, "block_size", lambda wanted, device: wanted)
             for given in cases("cpu", shapes):
-                trial._outcome(name, "gpu", given)
+                kernel_cases._outcome(name, "gpu", given)
     return list(noted)
 
 

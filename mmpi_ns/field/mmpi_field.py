@@ -133,15 +133,8 @@ class MMPIField(TexelTables):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its tables, and of its bricks if it is baked."""
-        tables = [*self.state_dict().values()]
-        if (baked := self.cached("baked")) is not None:
-            tables += [baked.mpis.columns, baked.mpis.density, baked.mpis.texels]
-        return sum(x.nbytes for x in tables)
-
-    def forget_baked(self) -> None:
-        """Drops the baked window, because the field is about to be trained."""
-        self._packed.pop(("baked", self.density.device), None)
+        """Bytes of its tables."""
+        return sum(x.nbytes for x in self.state_dict().values())
 
     # nerfstudio's Field ------------------------------------------------------------------------------------------
 

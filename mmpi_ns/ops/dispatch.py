@@ -1,7 +1,8 @@
 """Operations, and the choice of their form: the reference in plain torch, C++ on a CPU, or Triton kernels on a GPU.
 
-``--pipeline.model.ops`` chooses for the whole process. Where a compiled form is not available, or does not do on this
-device what the reference does (``trial.py``), that operation alone falls back to its reference, and the log says why.
+``--pipeline.model.ops`` chooses for the whole process. Where there is no compiler, or no Triton, the references run and
+the log says why. Whether kernels agree with the references on a GPU is seen before the first step
+(``training/agreement.py``).
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-import subprocess
+import os
+import shutil
 import sysconfig
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -22,8 +24,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
-from mmpi_ns.ops.layout import SMALL, Shapes, annotated, check_shapes
-from mmpi_ns.utils.errors import InputError, brief, say
+from mmpi_ns.ops.layout import annotated, check_shapes
+from mmpi_ns.utils.errors import InputError, say
 
 Route = Literal["auto", "torch", "native"]
 Form = Literal["reference", "cpu", "gpu"]
@@ -38,12 +40,7 @@ _PRECISIONS = (torch.float32, torch.bfloat16)
 _chosen: Route = "auto"
 interpreting = False
 """Whether Triton's interpreter runs the GPU kernels on CPU tensors, for tests and rehearsals; very slow."""
-_faults: dict[str, str | None] = {}
-"""What is known of the compiler ("C++"), of Triton, and of each operation's GPU form: None is well, else why not."""
-_trying = threading.RLock()
-_shapes = SMALL
-"""What kernels are tried with."""
-_tries_afresh = False
+_choosing = threading.RLock()
 
 
 class Operation(Generic[P, R]):
@@ -89,18 +86,7 @@ class Operation(Generic[P, R]):
         if self.check is not None:
             self.check(*values)
         form = form_of(self.name, *tensors_in(values))
-        if form != "gpu" or _chosen == "native":
-            return function(self.name, form)(*values)
-        try:
-            return function(self.name, "gpu")(*values)
-        except Exception as error:  # Triton's, its compiler's or the assembler's complaint about a kernel, or another
-            complaint = isinstance(error, RuntimeError) and ("PassManager" in str(error) or "ptxas" in str(error))
-            if not complaint and not isinstance(error, importlib.import_module("triton.errors").TritonError):
-                raise
-            # A shape that the trial did not have; nothing has run.
-            reason = f"{self.name} does not compile for this GPU ({type(error).__name__}: {brief(error)[:200]})"
-            _faults[self.name] = _say(reason, f"Plain torch for {self.name}")
-            return function(self.name, "reference")(*values)
+        return function(self.name, form)(*values)
 
     def _in_cpp(self, *values: Any) -> Any:
         """``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ as the form for a CPU.
@@ -171,7 +157,7 @@ def form_of(name: str, *tensors: Tensor) -> Form:
         return "reference"
     if devices == {"cpu"} and not interpreting:
         return "cpu" if "cpu" in compiled and fault("C++") is None else "reference"
-    if devices == ({"cpu"} if interpreting else {"cuda"}) and "gpu" in compiled and fault(name) is None:
+    if devices == ({"cpu"} if interpreting else {"cuda"}) and "gpu" in compiled and fault("Triton") is None:
         return "gpu"
     return "reference"
 
@@ -190,36 +176,17 @@ def choose(path: Route) -> None:
     _chosen = path
     if path != "native":
         return
-    on_gpu = torch.cuda.is_available() or interpreting
-    names = ["Triton", *(n for n, each in operations().items() if "gpu" in each.compiled)] if on_gpu else ["C++"]
-    if reason := next((r for n in names if (r := fault(n)) is not None), None):
+    if reason := fault("Triton" if torch.cuda.is_available() or interpreting else "C++"):
         raise InputError(
             f"The compiled operations are not available ({reason}): use --pipeline.model.ops auto or torch."
         )
-
-
-def expect(shapes: Shapes, afresh: bool = False) -> None:
-    """Kernels that have not been tried with these shapes are, before they are used.
-
-    Args:
-        shapes: of the run at hand.
-        afresh: also what passed on this device before.
-    """
-    global _shapes, _tries_afresh
-    with _trying:
-        if afresh or (shapes != _shapes and not interpreting):  # the interpreter would take minutes
-            _shapes, _tries_afresh = shapes, afresh
-            for name, each in operations().items():
-                if "gpu" in each.compiled:
-                    _faults.pop(name, None)
-            _announce.cache_clear()
 
 
 @contextmanager
 def chosen(path: Route) -> Iterator[None]:
     """Within the block, operations use these forms."""
     global _chosen
-    with _trying:
+    with _choosing:
         before, _chosen = _chosen, path
         try:
             yield
@@ -227,17 +194,10 @@ def chosen(path: Route) -> Iterator[None]:
             _chosen = before
 
 
-def fault(name: str) -> str | None:
-    """Why the compiler, Triton or an operation's GPU form cannot be used; determined and logged once."""
-    if name not in _faults:
-        with _trying:
-            if name not in _faults:
-                _faults[name] = _try(name)
-    return _faults[name]
-
-
-def _try(name: str) -> str | None:
-    if name == "C++":
+@functools.cache
+def fault(what: Literal["C++", "Triton"]) -> str | None:
+    """Why the compiler or Triton cannot be used; None where it can. Found out and said once."""
+    if what == "C++":
         try:
             if not build.library_file().is_file():
                 CONSOLE.print("Compiling the inner loops for this processor: half a minute, once.")
@@ -245,50 +205,21 @@ def _try(name: str) -> str | None:
         except build.CannotCompile as error:
             return _say(str(error))
         return None
-    if name == "Triton":
-        try:
-            version = importlib.import_module("triton").__version__
-        except ImportError as error:
-            return _say(f"Triton cannot be imported ({error})")
-        if tuple(int(n) for n in version.split(".")[:2]) < OLDEST_TRITON:
-            return _say(f"Triton {version} is too old for the GPU's kernels, which need torch 2.5 or newer")
-        return None
-    if (reason := fault("Triton")) is not None:
-        return reason
-    try:  # the kernels with the shapes at hand, unless they passed before on this device
-        trial = importlib.import_module("mmpi_ns.ops.trial")  # which tries operations, so it comes after this one
-        record: Path | None = None if interpreting else trial.record(name, _shapes)
-        if record is None:
-            trial.run(name, "cpu", _shapes)
-        elif _tries_afresh or not record.is_file():
-            _announce()
-            trial.run(name, "cuda", _shapes)
-            record.parent.mkdir(parents=True, exist_ok=True)
-            record.touch()
-    except Exception as error:  # a driver, a compiler or a cache folder may fail in many ways: all mean plain torch
-        headers = Path(sysconfig.get_paths()["include"]) / "Python.h"
-        # Triton has a piece of C compiled for each kernel.
-        if isinstance(error, RuntimeError) and "C compiler" in str(error):
-            lacking = "Triton finds no C compiler: install gcc"
-        elif isinstance(error, subprocess.CalledProcessError) and not headers.is_file():
-            version = sysconfig.get_python_version()
-            lacking = f"Triton needs Python's headers, and {headers} is missing: install python{version}-dev"
-        elif isinstance(error, subprocess.CalledProcessError):
-            compiler = Path(error.cmd[0]).name
-            lacking = f"{compiler} cannot compile what starts Triton's kernels; its words are above"
-        else:
-            words = f"{type(error).__name__}: {brief(error)[:200]}"
-            return _say(f"its Triton kernel fails on this device ({words})", f"Plain torch for {name}")
-        _faults["Triton"] = _say(lacking)  # no other kernel will do better
-        return lacking
+    try:
+        version = importlib.import_module("triton").__version__
+    except ImportError as error:
+        return _say(f"Triton cannot be imported ({error})")
+    if tuple(int(n) for n in version.split(".")[:2]) < OLDEST_TRITON:
+        return _say(f"Triton {version} is too old for the GPU's kernels, which need torch 2.5 or newer")
+    if shutil.which(os.environ.get("CC", "gcc")) is None and shutil.which("clang") is None:
+        return _say("Triton finds no C compiler: install gcc")
+    headers = Path(sysconfig.get_paths()["include"]) / "Python.h"
+    if not headers.is_file():
+        package = f"python{sysconfig.get_python_version()}-dev"
+        return _say(f"Triton needs Python's headers, and {headers} is missing: install {package}")
     return None
 
 
-@functools.cache
-def _announce() -> None:
-    CONSOLE.print(f"Compiling kernels for {torch.cuda.get_device_name()}: about a minute, once.")
-
-
-def _say(reason: str, instead: str = "Plain torch instead of the compiled operations") -> str:
-    say(f"{instead}, several times slower: {reason}.")
+def _say(reason: str) -> str:
+    say(f"Plain torch instead of the compiled operations, several times slower: {reason}.")
     return reason

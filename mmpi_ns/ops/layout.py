@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, get_args, get_type_hints
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.build import structs
 from mmpi_ns.scene.geometry import Cube, Frames
-from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import MPIPlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 
 
@@ -151,30 +151,6 @@ def dense_fields(values: Any) -> list[Any]:
     """``dense`` for the tensors of a named tuple, each of the type that it is annotated with."""
     forms = annotated(type(values))
     return [x for name, value in values._asdict().items() for x in dense(value, dtype=forms[name][1])]
-
-
-class Shapes(NamedTuple):
-    """What kernels are compiled for in a run."""
-
-    mpis: tuple[int, ...] = (2,)
-    """Numbers of MPIs of the windows."""
-    cube: bool = True
-    blends: bool = True
-    """Whether samples are blended by reliability."""
-    channels: int = 8
-    """Of the colour features of a texel; density and reliability have one."""
-
-    @staticmethod
-    def of(plans: Iterable[ScenePlan], blends: bool, channels: int) -> Shapes:
-        """The shapes of a run's windows."""
-        plans = tuple(plans)
-        mpis = tuple(sorted({len(each.mpis) for p in plans for each in (p, p.largest)}))
-        return Shapes(mpis, any(p.cube is not None for p in plans), blends, channels)
-
-
-SMALL = Shapes()
-EVERY = (Shapes((1, 2, 5, 9, 33)), Shapes((1, 4, 16, 64), cube=False, channels=9))
-"""What plans commonly need: for checks that no plan asks for."""
 
 
 def check_shapes(owner: Callable[..., Any], values: Mapping[str, Any], sizes: dict[str, int] | None = None) -> None:

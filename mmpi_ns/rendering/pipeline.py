@@ -17,7 +17,7 @@ from torch import Tensor
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.details import moved_cameras
 from mmpi_ns.rendering.exposure import exposure_of_image
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import say
 from mmpi_ns.utils.random_draws import generator
 
 REFINED = "refined_"
@@ -105,14 +105,7 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
 
     Returns:
         The moved camera, its rotation in degrees, and its translation in scene units.
-
-    Raises:
-        InputError: the model renders what has no gradients.
     """
-    if model.config.rendering.mode == "baked":
-        raise InputError(
-            "Poses are refined by gradients: use --pipeline.model.rendering.mode exact, or no refine-eval-poses."
-        )
     moves: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=model.device)
     optimizer = torch.optim.Adam(moves.parameters(), lr=RATES[0])
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1 / STEPS))

@@ -37,10 +37,6 @@ def background_of(name: str, like: Tensor) -> Tensor:
 class RenderingConfig:
     """Images: ``--pipeline.model.rendering.*``."""
 
-    mode: Literal["auto", "exact", "baked"] = "auto"
-    """Render the field itself (exact), or 8-bit texels baked from it before the first image (baked: half of the time on
-    a CPU, 0.01 dB less; docs/export.md). auto: baked for ns-render and ns-viewer on a CPU if the model can be baked;
-    exact during training, in ns-eval and on a GPU."""
     threshold: float = 3e-3
     """Samples of less weight are not shaded when rendering; their total weight is reported (dropped_mass)."""
     background: Literal["black", "gray", "white"] = "gray"
@@ -54,9 +50,6 @@ class RenderingConfig:
     resident_gib: float = 2.0
     """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
     fit are kept, at least one; the least recently used is evicted first."""
-    half_windows: bool = False
-    """Write the finished windows of a long capture in half precision: half of the disk space; images change by a
-    fraction of a grey level."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from weakref import WeakValueDictionary
 import torch
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import to_text, write_atomically
@@ -33,8 +32,6 @@ class WindowStore:
     """Makes a field of the run's settings to load into."""
     budget: float = 0.0
     """Bytes of the windows kept for rendering. The window being rendered is kept in any case."""
-    half: bool = False
-    """Write tables in half precision."""
     _lock: Lock = field(default_factory=Lock)
     _held: dict[int, MMPIField] = field(default_factory=dict)
     """Windows in memory, the most recently used last."""
@@ -61,10 +58,7 @@ class WindowStore:
         """Writes a finished window atomically. Raises WriteError if the disk is full or cannot be written."""
         path = self.path(window)
         path.parent.mkdir(parents=True, exist_ok=True)
-        tables = field.state_dict()
-        if self.half:
-            tables = in_half_precision(tables)
-        state = {"window": window, "field": tables}
+        state = {"window": window, "field": field.state_dict()}
         write_atomically(path, lambda unfinished: torch.save(state, unfinished))
 
     def load(self, window: int, device: torch.device) -> MMPIField:
@@ -87,7 +81,7 @@ class WindowStore:
                     )
                 try:
                     state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
-                    needed = sum(x.nbytes * (2 if x.dtype == torch.float16 else 1) for x in state.values())
+                    needed = sum(x.nbytes for x in state.values())
                     while self._held and needed + sum(held.nbytes for held in self._held.values()) > self.budget:
                         del self._held[next(iter(self._held))]  # the least recently used
                     field = self.empty()

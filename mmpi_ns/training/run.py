@@ -165,7 +165,6 @@ class TrainingRun:
         """
         progress, field, schedule = self.progress, self.field, self.progress.schedule
         progress.step = step
-        field.forget_baked()
         optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
         groups, window = self.parameters(), schedule.window_at(step)
         if window != progress.window:  # the trainer has saved the previous one

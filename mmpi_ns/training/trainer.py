@@ -18,11 +18,14 @@ from nerfstudio.utils import comms, writer
 
 from mmpi_ns.data.checks import LOAD_RUNS
 from mmpi_ns.data.datamanager import MMPIDataManager
+from mmpi_ns.ops import dispatch
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
-from mmpi_ns.rendering.rendered import BACKGROUNDS
+from mmpi_ns.rendering.rendered import BACKGROUNDS, bounded
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.training.agreement import RAYS as AGREEMENT_RAYS
+from mmpi_ns.training.agreement import disagreement
 from mmpi_ns.training.checkpoints import (
     PLAN_FILE,
     cameras_in_short,
@@ -44,6 +47,7 @@ from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import command, discard, enter_command, signals_go_to, values_of
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
+from mmpi_ns.utils.random_draws import generator
 from mmpi_priors.new_views import image_and_mask
 
 
@@ -134,6 +138,7 @@ class MMPITrainer(Trainer):
             if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
                 torch.cuda.set_device(self.local_rank)
             self._stopped_by: int | None = None
+            self._compared = False
             self._log: TrainingLog | None = None
             self._began = monotonic()
             config = self.config
@@ -283,8 +288,27 @@ class MMPITrainer(Trainer):
         finally:
             self.config.max_num_iterations = self._window_steps
 
+    def kernels_differ(self) -> str:
+        """What the compiled operations compute otherwise than plain torch on a small batch of rays, in words."""
+        run, model, sources = self._run, cast(Any, self.pipeline.model), self._manager.sources
+        assert sources is not None, "a step has drawn rays"
+        progress, field = run.progress, run.field
+        g = generator(model.config.seed, progress.step, "agreement", self.device)
+        bundle, _ = sources.draw(AGREEMENT_RAYS, g)
+        forming = not progress.schedule.sharpened(progress.step)
+        options = model.config.sampling.options(field.plan, forming, model.blends(field))
+        return disagreement(field, bounded(bundle, field.plan), options)
+
     def train_iteration(self, step: int) -> Any:
         """One step; records that it ran, and saves a window of several after its last step."""
+        if not self._compared and str(self.device).startswith("cuda"):
+            self._compared = True
+            if differs := self.kernels_differ():
+                say(
+                    f"Plain torch is used, several times slower: this GPU's kernels differ from it ({differs}).",
+                    "yellow",
+                )
+                dispatch.choose("torch")
         loss, *others = super().train_iteration(step)
         self._last_step = step
         if self._log is not None:

@@ -4,16 +4,14 @@ from how large a mask on anything counts."""
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mmpi_priors import moving
 from mmpi_priors.dense import Depth
-from mmpi_priors.moving import WALKERS, find_moving, key_images
+from mmpi_priors.moving import find_moving, key_images
 from mmpi_priors.moving_evidence import Shot
-from mmpi_priors.people import NOBODY
 from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import View
 
@@ -62,13 +60,12 @@ def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatc
         if first is None:
             looked_at.append(i)
             assert not any(mask.any() for mask in masks) and set(near) <= set(range(0, 49, 2))
-        return np.full((50, 100), something_moves and i in shows), SimpleNamespace(walkers=np.zeros(1, bool))
+        return np.full((50, 100), something_moves and i in shows), object()
 
     monkeypatch.setattr(moving, "find_depths", depths)
     monkeypatch.setattr(moving, "_moves", moves)
     for name in ("_followed_on", "_outlined"):
         monkeypatch.setattr(moving, name, lambda shots, near, masks, *_: masks)
-    monkeypatch.setattr(moving, "people_in", lambda *_: NOBODY)
     _, masks, _ = find_moving(aside(*np.arange(49) * 0.0099), lambda i: wall())
     assert compared == [list(range(0, 49, 2))]
     assert sorted(looked_at[:9]) == [*range(0, 49, 6)]
@@ -79,8 +76,8 @@ def test_frames_between_key_images_are_looked_at_only_near_what_moves(monkeypatc
         assert len(looked_at) == 9
 
 
-@pytest.mark.parametrize(("large", "walkers"), [(False, 0), (True, 0), (False, WALKERS - 1), (False, WALKERS)])
-def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_in_several(monkeypatch, large, walkers):
+@pytest.mark.parametrize("large", [False, True])
+def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, large):
     view = View(np.zeros((20, 50), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((20, 50), bool))
     nothing = Depth(*np.zeros((2, 20, 50), np.float32))
     shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), nothing, None) for _ in range(5)]
@@ -88,19 +85,15 @@ def test_small_masks_count_only_where_one_image_has_a_large_one_or_people_walk_i
     def moves(shots, near, i, masks, uprights, first):
         mask = np.zeros((20, 50), bool)
         mask.flat[: (16 if large else 14) if i == 1 else 3] = True
-        person = np.zeros((20, 50), bool)
-        person[0, :2] = i < walkers
-        return mask, SimpleNamespace(walkers=person)
+        return mask, None
 
     monkeypatch.setattr(moving, "find_depths", lambda *_: iter(shots))
     monkeypatch.setattr(moving, "_moves", moves)
     margin = np.arange(1000).reshape(20, 50) >= 990  # of outlines, which does not count
     monkeypatch.setattr(moving, "_followed_on", lambda shots, near, masks, *_: masks)
     monkeypatch.setattr(moving, "_outlined", lambda shots, near, masks, *_: [mask | margin for mask in masks])
-    monkeypatch.setattr(moving, "people_in", lambda *_: NOBODY)
     poses = np.tile(np.eye(4)[:3], (5, 1, 1))
     poses[:, 0, 3] = range(5)
     images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile([50.0, 20], (5, 1)), np.zeros((5, 4)))
     _, masks, _ = find_moving(images, lambda i: np.zeros((0, 3)))
-    people = [2 * (i < walkers == WALKERS) for i in range(5)]
-    assert [int(mask.sum()) for mask in masks] == ([13, 26, 13, 13, 13] if large else people)
+    assert [int(mask.sum()) for mask in masks] == ([13, 26, 13, 13, 13] if large else [0] * 5)

@@ -19,7 +19,6 @@ from mmpi_priors.moving import reaches_side
 from mmpi_priors.moving_carry import Carried, carried, whole_objects
 from mmpi_priors.moving_evidence import Neighbour, Shot
 from mmpi_priors.moving_objects import followed
-from mmpi_priors.people import NOBODY
 from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import View
 
@@ -139,10 +138,10 @@ def five_in_a_row(monkeypatch, second: list[np.ndarray], first: np.ndarray, **pa
 
     def moves(shots, near, i, masks, uprights, look):
         mask = first if look is None else second[i]
-        return mask, moving._Look([np.ones(3)] * len(near), unused, unused, np.zeros_like(mask), unused, mask)
+        return mask, moving._Look([np.ones(3)] * len(near), unused, unused, unused, mask)
 
     replaced = {
-        "find_depths": lambda *_: iter(shots), "people_in": lambda *_: NOBODY, "_moves": moves,
+        "find_depths": lambda *_: iter(shots), "_moves": moves,
         "_outlined": lambda shots, near, masks, *_: masks,
         "neighbours": lambda images, i, keys: [j for j in (i - 1, i + 1) if 0 <= j < 5],
         "num_threads": lambda: 1,

@@ -90,7 +90,7 @@ def test_nothing_leaves_just_above_seeds():
 
 
 @pytest.mark.parametrize("box", [np.s_[2:12, 60:75], np.s_[50:58, 5:15]])
-def test_people_without_seeds_stay(box):
+def test_objects_without_seeds_stay(box):
     person = in_box(box)
     shown = outline(in_box(HALO) | person, in_box(np.s_[30:34, 38:42]))
     assert shown[box].all()

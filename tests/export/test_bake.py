@@ -11,20 +11,18 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.utils.eval_utils import eval_setup
 from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.shading import RayShader
-from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import psnr
-from mmpi_ns.rendering.rendered import bounded, shown_outputs
+from mmpi_ns.rendering.rendered import bounded, shown_outputs, winners
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_show import __main__ as export
 from mmpi_show import bake as bake_module
 from mmpi_show import windows as baking
-from mmpi_show.bake import bake_run, compare
+from mmpi_show.bake import bake_of_model, bake_run, compare
 from mmpi_show.files import read_baked, write_baked
 from mmpi_show.scene import brick_numbers
 
@@ -42,7 +40,6 @@ def filled(trainer, seed=0):
     """A model whose densities, colours and features are random."""
     model = trainer.pipeline.model.eval()
     field, g = model.field, torch.Generator().manual_seed(seed)
-    field.forget_baked()
     field.density.data[64:] = torch.randn(len(field.density) - 64, 1, generator=g) * 2 + 1.5
     field.features.data[64:] = torch.randn(len(field.features) - 64, field.feature_channels, generator=g)
     field.reliability.data = torch.randn(field.reliability.shape, generator=g)
@@ -59,11 +56,13 @@ def bundle_of(plan, count=400):
 
 
 def outputs(model, how, rays):
-    model.config.rendering.mode = how
+    """Of the exact renderer, or of the baked window."""
     with torch.no_grad():
-        found = model.get_outputs(copy.deepcopy(rays))
-    model.config.rendering.mode = "auto"
-    return found
+        if how == "exact":
+            return model.get_outputs(copy.deepcopy(rays))
+        bundle, field = bounded(copy.deepcopy(rays), model.field.plan), model.field
+        drawn = bake_of_model(model, field).render(bundle.origins, bundle.directions, (bundle.nears, bundle.fars))
+        return drawn | winners(drawn, bundle, field, 0)
 
 
 def test_baked_images_are_the_exact_ones(trainer, monkeypatch):
@@ -89,7 +88,6 @@ def test_finer_copies_are_baked_and_shown_as_parts_of_their_mpis(trainer, monkey
     chosen = (field.tiles > 0) & (torch.rand(len(field.tiles), generator=torch.Generator().manual_seed(1)) < 0.6)
     field.copy_finely(chosen)
     request.addfinalizer(lambda: field.build(plan, factor))
-    field.forget_baked()
     exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
     assert (exact["rgb"] - baked["rgb"]).square().mean() < 1e-4 and exact["rgb"].std() > 0.05
     for each in (exact, baked):
@@ -116,74 +114,9 @@ def test_blending_is_baked_into_the_bricks(trainer, monkeypatch):
     rays = bundle_of(model.field.plan)
     exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
     error = (exact["rgb"] - baked["rgb"]).square().mean()
-    model.field.forget_baked()
     monkeypatch.setattr(model.config.schedule, "training", "joint")
     unblended = outputs(model, "baked", rays)
     assert error < 1e-3 and error < 0.2 * (exact["rgb"] - unblended["rgb"]).square().mean()
-
-
-def test_what_is_looked_at_is_baked_and_what_is_measured_is_not(trainer, monkeypatch):
-    """Render auto: bricks, but the field of a model that trains, that is measured, or whose gradients are asked for."""
-    model = filled(trainer)
-    rays = bundle_of(model.field.plan)
-    exact, baked = (outputs(model, how, rays)["rgb"] for how in ("exact", "baked"))
-    assert not torch.equal(exact, baked)
-    auto = lambda: outputs(model, "auto", rays)["rgb"]  # noqa: E731
-    assert model.trains and torch.equal(auto(), exact)
-    monkeypatch.setattr(model, "trains", False)
-    assert torch.equal(auto(), baked)
-    monkeypatch.setattr(model, "scoring", model.scores_and_images)
-    assert torch.equal(auto(), exact)
-    monkeypatch.setattr(model, "scoring", None)
-    assert torch.equal(auto(), baked)
-    monkeypatch.setattr(model.config.rendering, "mode", "auto")
-    with torch.enable_grad():
-        model.get_outputs(copy.deepcopy(rays))["rgb"].sum().backward()
-    assert model.field.features.grad is not None and model.field.features.grad.abs().sum() > 0
-    model.field.zero_grad()
-
-
-def test_a_model_that_cannot_be_baked_is_shown_as_it_is(trainer, monkeypatch):
-    """Render auto: no sentence, no failure; nor without a compiler, where plain torch would take longer than before."""
-    model = filled(trainer)
-    rays = bundle_of(model.field.plan)
-    exact = outputs(model, "exact", rays)["rgb"]
-    monkeypatch.setattr(model, "trains", False)
-    assert not torch.equal(outputs(model, "auto", rays)["rgb"], exact)
-    monkeypatch.setattr(baking, "MOST_CHANNELS", 2)
-    assert torch.equal(outputs(model, "auto", rays)["rgb"], exact)
-    monkeypatch.undo()
-    monkeypatch.setattr(model, "trains", False)
-    dispatch.choose("torch")
-    try:
-        torch.testing.assert_close(outputs(model, "auto", rays)["rgb"], exact, atol=1e-4, rtol=0)
-    finally:
-        dispatch.choose("auto")
-
-
-def test_ns_eval_scores_the_field_and_a_render_shows_the_bricks(trainer):
-    """A run loaded as nerfstudio's commands load it."""
-    filled(trainer)
-    trainer.save_checkpoint(0)
-    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
-    model = pipeline.model
-    assert model.config.rendering.mode == "auto" and not model.trains
-    camera = pipeline.datamanager.eval_dataset.cameras[:1]
-    shown = model.get_outputs_for_camera(camera)["rgb"]
-    scores = {}
-    for how in ("auto", "exact", "baked"):
-        model.config.rendering.mode = how
-        scores[how] = pipeline.get_average_eval_image_metrics()["psnr"]
-    assert scores["auto"] == scores["exact"] != scores["baked"]
-    assert torch.equal(shown, model.get_outputs_for_camera(camera)["rgb"])
-
-
-def test_training_on_forgets_what_was_baked(trainer):
-    model = filled(trainer)
-    first = model.baked(model.field)
-    assert model.baked(model.field) is first
-    model.field.forget_baked()
-    assert model.baked(model.field) is not first
 
 
 def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
@@ -191,7 +124,7 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
     model = filled(trainer)
     monkeypatch.setattr("mmpi_show.bake.load_model", lambda *_: trainer.pipeline)
     scene = export.Bake(tmp_path / "config.yml", compare=2).bake()
-    whole, told = model.baked(model.field), capsys.readouterr().out
+    whole, told = bake_of_model(model, model.field), capsys.readouterr().out
     kept = scene.windows[0][1]
     assert 0 < kept.mpis.num_bricks < whole.mpis.num_bricks
     assert "bricks are seen" in told and "dB to the exact renderer's" in told
@@ -246,7 +179,7 @@ def test_codes_are_off_where_training_views_see_little_of_them(trainer, monkeypa
 
 def test_the_weights_of_an_image_are_looked_at_in_parts(trainer, monkeypatch):
     """A photo of 12 megapixels at once would take gigabytes."""
-    window = filled(trainer).baked(trainer.pipeline.model.field)
+    window = bake_of_model(filled(trainer), trainer.pipeline.model.field)
     rays = bundle_of(trainer.pipeline.model.field.plan)
     largest: list[int] = []
     shown = baking.show_baked
@@ -296,21 +229,20 @@ def test_lenses_are_undistorted_once(trainer, monkeypatch):
 
 def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
     model = filled(trainer)
-    model.field.forget_baked()
     monkeypatch.setattr(model.field, "feature_channels", 17)
     with pytest.raises(ValueError, match="16 is the most"):
-        model.baked(model.field)
+        bake_of_model(model, model.field)
     monkeypatch.undo()
     cube = CubePlan((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2, 2, 2))
     monkeypatch.setattr(model.field, "plan", replace(model.field.plan, cube=cube))
     with pytest.raises(ValueError, match="cube"):
-        model.baked(model.field)
+        bake_of_model(model, model.field)
     monkeypatch.undo()
     assert isinstance(model.field.networks, RayShader)
     model.field._modules["networks"] = torch.nn.Linear(1, 1)
     try:
         with pytest.raises(ValueError, match="shading ray"):
-            model.baked(model.field)
+            bake_of_model(model, model.field)
     finally:
         model.field._modules["networks"] = RayShader(1, 4, 8, 2)
 

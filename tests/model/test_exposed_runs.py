@@ -66,16 +66,6 @@ def test_pictures_are_shown_at_the_mean_exposure_or_at_the_nearest(run, monkeypa
     assert psnr(nearest["rgb"], mean["rgb"]) < 40
 
 
-def test_baked_pictures_have_the_same_exposure(run, monkeypatch):
-    _, pipeline = run
-    model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
-    images = {}
-    for mode in ("exact", "baked"):
-        monkeypatch.setattr(model.config.rendering, "mode", mode)
-        images[mode] = model.get_outputs_for_camera(cameras[1:2])["rgb"]
-    assert psnr(images["baked"], images["exact"]) > 35
-
-
 def test_the_deviation_of_one_image_is_0_and_no_nan(run):
     _, pipeline = run
     manager = pipeline.datamanager

@@ -159,13 +159,6 @@ def test_a_test_image_is_scored_twice_and_the_plain_score_stays(turned, capsys):
     assert model.field.density.requires_grad, "the field can be trained on"
 
 
-def test_poses_are_not_refined_against_what_has_no_gradients(turned):
-    turned.pipeline.model.config.rendering.mode = "baked"
-    with pytest.raises(InputError, match=r"rendering\.mode exact"):
-        turned.pipeline.get_average_eval_image_metrics()
-    turned.pipeline.model.config.rendering.mode = "auto"
-
-
 @pytest.mark.parametrize("part", ["origins", "directions"])
 def test_every_ray_follows_its_camera_and_pixels_of_images_alone_move_it(part):
     poses: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=2, device="cpu")

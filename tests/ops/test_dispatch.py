@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import inspect
 import math
@@ -11,14 +10,13 @@ import subprocess
 import pytest
 import torch
 from compiled import compiled  # noqa: F401
+from kernel_cases import CASES
 from random_fields import bundle, random_field, random_rays, render
 
-from mmpi_ns.ops import build, dispatch, trial
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops import build, dispatch
 
 
 def test_every_form_of_an_operation_has_its_signature():
-    assert len(dispatch.operations()) == 27
     for name, operation in dispatch.operations().items():
         for form in operation.compiled:
             if form == "gpu" and importlib.util.find_spec("triton") is None:
@@ -27,39 +25,8 @@ def test_every_form_of_an_operation_has_its_signature():
             assert parameters == list(operation.signature.parameters), (name, form)
 
 
-def test_every_operation_with_a_gpu_form_has_a_trial():
-    assert set(trial.CASES) == {name for name, each in dispatch.operations().items() if "gpu" in each.compiled}
-
-
-def in_float64(x):
-    """Arguments of an operation, with all that they hold."""
-    if isinstance(x, torch.Tensor):
-        return x.double() if x.dtype == torch.float32 else x
-    if isinstance(x, SceneLayout):
-        x = dataclasses.replace(x, packed={})  # made anew in float64
-    if dataclasses.is_dataclass(x):
-        return dataclasses.replace(x, **{f.name: in_float64(getattr(x, f.name)) for f in dataclasses.fields(x)})
-    if isinstance(x, tuple) and hasattr(x, "_fields"):
-        return type(x)(*map(in_float64, x))
-    return type(x)(map(in_float64, x)) if isinstance(x, tuple | list) else x
-
-
-@pytest.mark.parametrize("name", trial.CASES)
-def test_a_kernel_that_only_rounds_otherwise_passes_its_trial(monkeypatch, name):
-    """Float64 stands for it."""
-    right = dispatch.function
-
-    def exactly(*given):
-        exact = in_float64(given)
-        made = right(name, "reference")(*exact)
-        if made is None:  # it works in place
-            for a, b in zip(given, exact, strict=True):
-                if isinstance(a, torch.Tensor):
-                    a.copy_(b)
-        return made
-
-    monkeypatch.setattr(dispatch, "function", lambda name, form: exactly if form == "gpu" else right(name, form))
-    trial.run(name, "cpu")
+def test_every_operation_with_a_gpu_form_has_cases():
+    assert set(CASES) == {name for name, each in dispatch.operations().items() if "gpu" in each.compiled}
 
 
 @pytest.fixture
@@ -67,9 +34,10 @@ def unbuilt(monkeypatch, tmp_path):
     """A machine on which nothing has been compiled yet."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     build.library.cache_clear()
-    monkeypatch.setattr(dispatch, "_faults", {})
+    dispatch.fault.cache_clear()
     yield tmp_path
     build.library.cache_clear()
+    dispatch.fault.cache_clear()
 
 
 def test_without_a_compiler_plain_torch_runs_and_the_log_says_so(monkeypatch, unbuilt, capsys):
@@ -115,7 +83,7 @@ def test_what_was_compiled_is_used_again(monkeypatch, unbuilt):
     assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
     assert [p.suffix for p in (unbuilt / "mmpi_ns").iterdir()] == [".so"]
     build.library.cache_clear()
-    dispatch._faults.clear()
+    dispatch.fault.cache_clear()
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: pytest.fail("compiled twice"))
     assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
 

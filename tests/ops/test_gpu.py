@@ -15,13 +15,12 @@ from triton_processes import HERE, needs_triton, python
 from waits import TRAININGS, counted_on_a_gpu, waits_of_phases
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.gather import gather_taps
 
 
 @needs_triton
 def test_kernels_by_the_interpreter():
     """The variable must be set before Triton is imported, so these tests have a process of their own."""
-    files = [str(HERE / "ops" / f"interpreted_{part}.py") for part in ("march", "rows", "show", "steps", "trial")]
+    files = [str(HERE / "ops" / f"interpreted_{part}.py") for part in ("march", "rows", "show", "steps")]
     found = python("-m", "pytest", "-p", "no:cacheprovider", *files, TRITON_INTERPRET="1")
     assert found.returncode == 0, found.stdout[-6000:] + found.stderr[-2000:]
     passed = re.search(r"(\d+) passed", found.stdout)
@@ -140,13 +139,14 @@ def test_importing_the_package_imports_no_kernel():
 def no_triton(monkeypatch):
     """A machine with a GPU (whose tensors are the CPU's) and without Triton."""
     dispatch.function.cache_clear()
-    monkeypatch.setattr(dispatch, "_faults", {})
+    dispatch.fault.cache_clear()
     monkeypatch.setattr(dispatch, "_chosen", "auto")
     for name in [m for m in sys.modules if m.startswith("mmpi_ns.ops") and "gpu" in m]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "triton", None)
     yield
     dispatch.function.cache_clear()
+    dispatch.fault.cache_clear()
 
 
 def test_without_triton_plain_torch_runs_and_the_log_says_so(monkeypatch, no_triton, capsys):
@@ -167,26 +167,13 @@ def test_without_triton_plain_torch_runs_and_the_log_says_so(monkeypatch, no_tri
 
 
 @pytest.mark.parametrize(("version", "accepted"), [("3.0.0", False), ("3.1.0", True), ("3.10.0+git", True)])
-def test_a_triton_too_old_for_the_kernels_is_refused_in_one_sentence(monkeypatch, capsys, version, accepted):
-    monkeypatch.setattr(dispatch, "_faults", {})
+def test_a_triton_too_old_for_the_kernels_is_refused_in_one_sentence(monkeypatch, capsys, request, version, accepted):
+    dispatch.fault.cache_clear()
+    request.addfinalizer(dispatch.fault.cache_clear)
     monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__=version))
     assert (dispatch.fault("Triton") is None) == accepted
     said = " ".join(capsys.readouterr().out.split())
     assert accepted == (not said) and (accepted or (f"Triton {version} is too old" in said and "torch 2.5" in said))
-
-
-def test_a_kernel_that_does_not_compile_for_a_shape_leaves_its_operation_to_plain_torch(monkeypatch, capsys):
-    def fails(*given):
-        raise RuntimeError("`ptxas` failed with error code 255")
-
-    right, no_samples = dispatch.function, (torch.zeros(0, 4), [], torch.zeros(0).long())
-    monkeypatch.setattr(dispatch, "_faults", {"gather_taps": None})
-    monkeypatch.setattr(dispatch, "form_of", lambda name, *tensors: "reference" if dispatch._faults[name] else "gpu")
-    monkeypatch.setattr(dispatch, "function", lambda name, form: fails if form == "gpu" else right(name, form))
-    for _ in range(2):
-        sums = gather_taps(*no_samples, torch.zeros(3, 2), torch.ones(3) > 0)
-        assert sums.gathered.tolist() == [[0.0] * 4] * 3
-    assert " ".join(capsys.readouterr().out.split()).count("Plain torch for gather_taps") == 1
 
 
 def test_on_a_cpu_nothing_takes_the_gpus_kernels():

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import kernel_cases
 import pytest
 import torch
 from jaxtyping import Float, Int
 from random_bricks import random_window, rays_into
 from torch import Tensor
 
-from mmpi_ns.ops import trial
 from mmpi_ns.ops.baked import show_baked
-from mmpi_ns.ops.layout import SMALL, Tables, check_shapes
+from mmpi_ns.ops.layout import Tables, check_shapes
 from mmpi_ns.ops.march import MarchOptions, Rays, march, show_rays
 
 
@@ -81,7 +81,7 @@ def changed(x, rows, columns):
 
 def walked():
     """Arguments of the march and of pictures: a layout, tables, features, rays and options."""
-    layout, tables, rays, _ = trial._marches("cpu", SMALL)[0]
+    layout, tables, rays, _ = kernel_cases.CASES["march"]("cpu", kernel_cases.SMALL)[0]
     heads, priorities = torch.ones(5, 3, dtype=torch.bool), torch.rand(5, 2)
     rays = Rays(*(x[:5] for x in rays[:4]), heads, priorities)
     return layout, tables, torch.zeros(len(tables.density), 4), rays, MarchOptions(0.01)

@@ -69,7 +69,6 @@ def test_what_two_processes_trained_is_evaluated_as_any_run(whole, shared):
     field = whole.pipeline.model.field
     trained = {name: x.clone() for name, x in field.state_dict().items()}
     field.load_state_dict(in_half_precision(trained))  # as the last checkpoint has it
-    pipeline.model.config.rendering.mode = "exact"
     colors, expected = (rendered(p.model, origins)["rgb"] for p in (pipeline, whole.pipeline))
     field.load_state_dict(trained)
     assert torch.equal(colors, expected)

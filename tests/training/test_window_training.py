@@ -12,7 +12,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from training_runs import WINDOW_STEPS as STEPS
 from training_runs import compared, differences, facing, load, ready, rendered, trainer_config
 
-from mmpi_ns.field.tables import TABLES, in_half_precision
+from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.windows import WindowedPlan, window_shares
 from mmpi_ns.training.initial import start_from_depths
@@ -131,7 +131,6 @@ def test_evaluation_reads_the_windows_back(whole):
     origins = torch.stack([torch.tensor(w.center).float() for w in model.progress.windows.windows])
     state = {name: x.clone() for name, x in model.field.state_dict().items()}
     model.field.load_state_dict(in_half_precision(state))  # as the last checkpoint has it
-    pipeline.model.config.rendering.mode = "exact"
     a, b = rendered(model, origins), rendered(pipeline.model, origins)
     model.field.load_state_dict(state)
     for name in ("rgb", "depth", "winning_mpi"):
@@ -236,23 +235,6 @@ def test_as_many_windows_are_held_as_fit_the_budget(whole, tmp_path, room, held)
         assert len(store._held) == 1 or taken <= room * size
 
 
-def test_the_bricks_of_a_held_window_take_room_too(whole, tmp_path):
-    """Room for two windows and a little; one that was baked is let go for the other."""
-    model = whole.pipeline.model
-    size = model.store.path(1).stat().st_size
-    for baked, expected in ((False, [0, 1]), (True, [1])):
-        store = WindowStore(tmp_path, model._new_field, budget=2.05 * size)
-        store.save(0, model.field)
-        store.save(1, model.field)
-        field = store.load(0, model.device)
-        before = field.nbytes
-        if baked:
-            model.baked(field)
-        assert (field.nbytes > before + 0.1 * size) == baked
-        store.load(1, model.device)
-        assert list(store._held) == expected
-
-
 def test_an_image_between_two_windows_reads_each_from_disk_once(scene, windows_file, tmp_path, monkeypatch):
     """With room for one window alone, chunk after chunk; the next image begins with the one that is in memory."""
     plan = WindowedPlan.load(windows_file)
@@ -285,25 +267,3 @@ def test_an_image_between_two_windows_reads_each_from_disk_once(scene, windows_f
     reads, again = read_windows(0.0, 100, monkeypatch, images=3)
     assert len(reads) == 4 and torch.equal(again["rgb"], chunks["rgb"])
     assert len(read_windows(float("inf"), 100, monkeypatch, images=3)[0]) == 2
-
-
-def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_were_rounded(
-    whole, scene, windows_file, tmp_path
-):
-    model = whole.pipeline.model
-    asked = ready(trainer_config(scene, windows_file, tmp_path, STEPS, half_windows=True)).pipeline.model.store
-    assert asked.half and not model.store.half
-    size = model.store.path(1).stat().st_size
-    store = WindowStore(tmp_path, model._new_field, budget=1.8 * size, half=asked.half)
-    store.save(0, model.field)
-    store.save(1, model.field)
-    assert store.path(1).stat().st_size < 0.65 * size
-    store.load(0, model.device)
-    field = store.load(1, model.device)
-    for name, values in field.state_dict().items():
-        wanted = model.field.state_dict()[name]
-        assert values.dtype == wanted.dtype
-        rounded = wanted.half().float() if name in TABLES else wanted
-        assert torch.equal(values, rounded), name
-    assert not torch.equal(field.features, model.field.features)
-    assert list(store._held) == [1], "what is held is counted as it lies in memory, not on disk"

@@ -1,69 +1,54 @@
-"""Tries an operation's GPU form on toy scenes: on the current device it must agree with the reference.
-
-The scenes have the shapes that kernels are compiled for in the run at hand: numbers of MPIs, channels. So an
-incompatible Triton release, driver or architecture is noticed here and not in the first step of a training, or never.
-"""
+"""Toy arguments for every operation that has a GPU form, and the comparison of its forms on them."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import partial
-from importlib import import_module
-from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops import build, dispatch
+from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.gather import Taps
-from mmpi_ns.ops.layout import SMALL, SceneLayout, Shapes, Tables
+from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MarchOptions, Rays
 from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 from mmpi_ns.scene.texels import BRICK, make_grids
-from mmpi_ns.utils.parallel import in_order
 
 CLOSE = 1e-3
 """Largest difference relative to the largest number: a wrong kernel is off by more, another order of sums by less."""
 RAYS, ROWS = 40, 300
-DRIVER = Path("/proc/driver/nvidia/version")
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-class Disagreement(Exception):
-    """A kernel ran and disagrees with its reference."""
+class Shapes(NamedTuple):
+    """What kernels are compiled for in a run."""
+
+    mpis: tuple[int, ...] = (2,)
+    cube: bool = True
+    blends: bool = True
+    channels: int = 8
 
 
-def run(name: str, device: str, shapes: Shapes = SMALL) -> None:
-    """Tries one operation on a device. Raises Disagreement if the results differ, or whatever Triton, its compiler or
-    the driver finds amiss."""
-    cases = CASES[name](device, shapes)
-    # Kernels compile side by side: Triton's passes hold no lock of Python. Its interpreter runs one at a time.
-    outcomes = (map if dispatch.interpreting else in_order)(lambda arguments: _outcome(name, "gpu", arguments), cases)
-    for arguments, kernel in zip(cases, list(outcomes), strict=True):
+SMALL = Shapes()
+EVERY = (Shapes((1, 2, 5, 9, 33)), Shapes((1, 4, 16, 64), cube=False, channels=9))
+
+
+def differences(name: str, device: str, shapes: Shapes = SMALL) -> list[float]:
+    """Of the GPU form of an operation and its definition, relative to the largest number, for each case."""
+    found = []
+    for arguments in CASES[name](device, shapes):
+        kernel = _outcome(name, "gpu", arguments)
         with dispatch.chosen("torch"):
             reference = _outcome(name, "reference", arguments)
         for a, b in zip(kernel, reference, strict=True):
-            if a.shape != b.shape:
-                raise Disagreement(f"it makes {list(a.shape)} numbers where plain torch makes {list(b.shape)}")
-            # Numbers of a type with few digits may be rounded up or down.
-            close = max(CLOSE, torch.finfo(b.dtype).eps if b.is_floating_point() else 0.0)
-            a, b = a.double(), b.double()
-            off = ~((a - b).abs() <= close * b.abs().max().clamp(min=1e-6)) if b.numel() else b
-            if off.any():
-                raise Disagreement(f"{float(off.double().mean()):.2g} of its numbers are not those of plain torch")
-
-
-def record(name: str, shapes: Shapes) -> Path:
-    """The file that is there once an operation has passed its trial on this GPU, with these versions and sources."""
-    device = torch.cuda.get_device_properties(torch.cuda.current_device())
-    driver = DRIVER.read_bytes() if DRIVER.is_file() else b""
-    versions = (device.name, device.major, device.minor, torch.__version__, import_module("triton").__version__)
-    sources = (path.read_bytes() for path in sorted(build.OPS.rglob("*.py")))
-    key = hashlib.sha256(b"\0".join([repr((name, shapes, versions)).encode(), driver, *sources])).hexdigest()
-    return build.cache_folder() / f"tried-{name}-{key[:16]}"
+            assert a.shape == b.shape, name
+            if b.numel():
+                found.append(float((a.double() - b.double()).abs().max() / b.double().abs().max().clamp(min=1e-6)))
+    return found
 
 
 def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:
@@ -81,9 +66,6 @@ def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:
         loss = sum((x * torch.linspace(-1, 1, x.numel(), device=x.device).view(x.shape)).sum() for x in numbers)
         numbers += list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
     return [x.detach() for x in numbers]
-
-
-# Toy inputs ----------------------------------------------------------------------------------------------------------
 
 
 def _random(device: str, *shape: int) -> Tensor:

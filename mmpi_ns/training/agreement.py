@@ -1,0 +1,71 @@
+"""Whether the compiled operations agree with plain torch on this device: one small batch, values and gradients."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.interpolate import Table
+from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.rendering.rendered import render_rays
+
+RAYS = 256
+"""Rays of the batch."""
+CLOSE = 1e-2
+"""Largest difference, as a norm relative to that of plain torch. A sample whose weight is the threshold's to the last
+bits may be kept by one form alone; a wrong kernel is off by more."""
+
+
+def disagreement(field: MMPIField, bundle: RayBundle, options: MarchOptions) -> str:
+    """What the compiled operations compute otherwise than plain torch, in words; empty where they agree.
+
+    Args:
+        field: to render.
+        bundle: rays with nears and fars.
+        options: which samples are kept, and how they are blended.
+    """
+    results = {}
+    for route in ("auto", "torch"):
+        with dispatch.chosen(route), torch.enable_grad():
+            results[route] = _values_and_gradients(field, bundle, options)
+    compiled, reference = results["auto"], results["torch"]
+    wrong = []
+    for name, (rows, values) in reference.items():
+        theirs, ours = _on_same_rows((rows, values), compiled[name])
+        difference = float((ours - theirs).norm() / theirs.norm().clamp(min=1e-12))
+        if not difference <= CLOSE:  # NaN too
+            wrong.append(f"{name} by {difference:.1%}")
+    return ", ".join(wrong)
+
+
+Rows = tuple[Int[Tensor, "U"], Float[Tensor, "U C"]]
+
+
+def _values_and_gradients(field: MMPIField, bundle: RayBundle, options: MarchOptions) -> dict[str, Rows]:
+    """Colours, accumulation and gradients of a fixed linear function of both, by rows."""
+    rays = render_rays(bundle, field, options)
+    values = torch.cat([rays.rgb, rays.composite.accumulation], -1)
+    slopes = torch.linspace(-1, 1, values.numel(), device=values.device).view_as(values)
+    (values * slopes).sum().backward()
+    found: dict[str, Rows] = {"colours": (torch.arange(len(values), device=values.device), values.detach().double())}
+    for name, parameter in field.named_parameters():
+        gradient, rows = parameter.grad, parameter.grad_rows if isinstance(parameter, Table) else None
+        if gradient is not None:
+            rows = torch.arange(len(gradient), device=values.device) if rows is None else rows.long()
+            found[f"gradients of {name}"] = rows, gradient.detach().double().flatten(1)
+        parameter.grad = None
+    return found
+
+
+def _on_same_rows(first: Rows, second: Rows) -> tuple[Tensor, Tensor]:
+    """Values of the rows of either, 0 where one has none."""
+    rows = torch.cat([first[0], second[0]]).unique()
+    parts = []
+    for numbers, values in (first, second):
+        whole = values.new_zeros(len(rows), values.shape[1])
+        parts.append(whole.index_add(0, torch.searchsorted(rows, numbers), values))
+    return parts[0], parts[1]
