@@ -17,13 +17,13 @@ from training_runs import datamanager, in_capture_frame, plan_of
 
 from mmpi_ns.data import rays
 from mmpi_ns.data.checks import say_once
+from mmpi_ns.data.priors import UNKNOWN, DepthPriors
 from mmpi_ns.data.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
 from mmpi_ns.data.rays import CameraRays, image_rays
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError
-from mmpi_priors import known_depth
-from mmpi_priors.known_depth import UNKNOWN, KnownDepth
+from mmpi_priors import depth_priors
 from mmpi_priors.sfm import MIN_TRACK
 
 TRACKED = sum(project(i, wall_points())[1].astype(int) for i in range(8)) >= MIN_TRACK
@@ -167,19 +167,19 @@ def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
 
 
 def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie_in_it(manager, monkeypatch):
-    seen, depths, dataset = manager.observations, manager.known_depth, manager.train_dataset
+    seen, depths, dataset = manager.observations, manager.depth_priors, manager.train_dataset
     keypoints, cells = len(seen.seen_by), (np.stack(depths.codes)[..., 0] > UNKNOWN).sum()  # a cell is one pixel here
     for most, both in ((keypoints / cells + 0.01, True), (keypoints / cells - 0.01, False)):
-        monkeypatch.setattr(known_depth, "MOST_KEYPOINTS", most)
-        placed = known_depth.of_cells(seen, depths, dataset)
+        monkeypatch.setattr(depth_priors, "MOST_KEYPOINTS", most)
+        placed = depth_priors.of_cells(seen, depths, dataset)
         assert len(placed.seen_by) == cells + both * keypoints and len(placed.seen_at) == both * len(seen.seen_at)
         assert np.array_equal(placed.seen_by[: both * keypoints], seen.seen_by[: both * keypoints])
         assert len(placed.points) == cells + both * len(seen.points)
-    monkeypatch.setattr(known_depth, "CELLS", 4)  # of 8 x 8 pixels
-    placed = known_depth.of_cells(manager.observations, manager.known_depth, manager.train_dataset)
+    monkeypatch.setattr(depth_priors, "CELLS", 4)  # of 8 x 8 pixels
+    placed = depth_priors.of_cells(manager.observations, manager.depth_priors, manager.train_dataset)
     expected = []
     for i in range(6):
-        inverse, error = np.moveaxis(manager.known_depth.image(i), -1, 0)
+        inverse, error = np.moveaxis(manager.depth_priors.image(i), -1, 0)
         for row, column in np.ndindex(3, 4):
             part = slice(8 * row, 8 * row + 8), slice(8 * column, 8 * column + 8)
             known = inverse[part] > 0
@@ -189,8 +189,8 @@ def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie
     distances = np.linalg.norm(placed.points[placed.seen_point] - placed.centers[placed.seen_by], axis=-1)
     assert len(expected) > 30 and len(placed.seen_at) == 0
     assert np.allclose(np.stack([placed.seen_by, distances], -1), expected, rtol=1e-5)
-    nothing = KnownDepth([np.full((HEIGHT, WIDTH, 2), UNKNOWN, np.int16)] * len(manager.train_dataset))
-    assert known_depth.of_cells(manager.observations, nothing, manager.train_dataset) is manager.observations
+    nothing = DepthPriors([np.full((HEIGHT, WIDTH, 2), UNKNOWN, np.int16)] * len(manager.train_dataset))
+    assert depth_priors.of_cells(manager.observations, nothing, manager.train_dataset) is manager.observations
 
 
 def test_a_keypoint_ray_ends_on_its_point_at_the_known_distance(manager):
