@@ -19,9 +19,9 @@ from training_runs import ready, trainer_config, write_plan, write_windows
 
 import mmpi_ns
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.ops.baked.reader import camera_rays
 from mmpi_ns.utils.errors import InputError
 from mmpi_show.files import HEADER, BakedScene, read_baked, write_baked
+from mmpi_show.ops.baked.reader import camera_rays
 
 ROOT = Path(__file__).parents[1]
 

@@ -16,9 +16,9 @@ from browser import CHROMIUM, browser, served
 from random_bricks import random_window, scene_of
 
 import mmpi_ns
-from mmpi_ns.ops.baked.reader import camera_rays
 from mmpi_ns.scene.windows import window_shares
 from mmpi_show.files import HEADER, read_baked, write_baked
+from mmpi_show.ops.baked.reader import camera_rays
 from mmpi_show.scene import neighbours, take_borders
 from mmpi_show.web import write_page
 
