@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["load"]
-
 
 def __getattr__(name: str) -> Any:
     """The function above, imported when it is first asked for: torch and nerfstudio take seconds."""
