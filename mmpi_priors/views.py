@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_ns.ops.matches import place_pixels
 from mmpi_ns.utils.errors import InputError
+from mmpi_priors.ops.matches import place_pixels
 
 Map = NDArray[np.float32]
 

@@ -27,7 +27,7 @@ from mmpi_ns.data.copies import fit_cameras
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.priors import Gains, Priors, PriorsConfig
 from mmpi_ns.data.ray_sources import PixelPool, RaySources, rays_to_keypoints
-from mmpi_ns.data.rays import CameraRays
+from mmpi_ns.data.rays import CameraRays, TrainingRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
@@ -35,7 +35,7 @@ from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import generator
 from mmpi_ns.utils.values import check_options
 
-Batch = tuple[RayBundle, dict[str, Any]]
+Batch = tuple[TrainingRays, dict[str, Any]]
 Parser = Literal["auto", "nerfstudio", "colmap"]
 CAPTURE = "capture"
 """Key of the ``Capture`` in the data set's metadata, by which nerfstudio hands it to the model."""
