@@ -109,7 +109,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             mode = kwargs.get("test_mode", "val")
             splits = ("train", "val", "test") if mode == "val" else ("train", "test")  # for the evaluation after it too
             check_transforms(parser, Path(config.data or parser.data), splits, opens=mode != "inference")
-            # The point cloud is read with the other priors, in float64. nerfstudio needs open3d for it, and asks on the
+        if isinstance(parser, NerfstudioDataParserConfig | ColmapDataParserConfig):
+            # Points are read with the other priors, in float64. nerfstudio needs open3d for them, and asks on the
             # terminal where a capture names none.
             parser = replace(parser, load_3D_points=False)
         self._parser = replace(config.dataparser, data=Path(config.data or config.dataparser.data))
