@@ -14,7 +14,7 @@ from mmpi_ns.data.datamanager import MMPIDataManagerConfig
 from mmpi_ns.data.priors import PriorsConfig
 from mmpi_ns.field.mmpi_field import ColourConfig
 from mmpi_ns.model import MMPIModelConfig
-from mmpi_ns.placement.defaults import DEFAULTS
+from mmpi_ns.placement.defaults import PLACEMENT, RAYS
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.rendering.pipeline import MMPIPipelineConfig
 from mmpi_ns.rendering.rendered import RenderingConfig
@@ -70,10 +70,10 @@ def _method(
 
 
 mmpi, mmpi_small = (
-    _method(name, text, steps=0, rays=DEFAULTS[name].rays, model=MMPIModelConfig(placement=DEFAULTS[name].placement))
+    _method(name, text, steps=0, rays=RAYS, model=MMPIModelConfig(placement=PLACEMENT))
     for name, text in (
-        ("mmpi", "MMPI: several multi-plane images, placed among the training cameras."),
-        ("mmpi-small", "MMPI in a size that a two-core CPU trains in minutes."),
+        ("mmpi", "MMPI: several multi-plane images, placed among the training cameras; minutes on a CPU."),
+        ("mmpi-small", "Another name of mmpi."),
     )
 )
 mmpi_kitti = _method(

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
-from mmpi_ns.training.options import check_nothing_left
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.values import Number, check_number
@@ -120,7 +119,6 @@ def read_run_config(path: Path) -> MMPIModelConfig:
         raise InputError(f"{path} is not a config.yml that ns-train wrote: give the one beside nerfstudio_models.")
     if not isinstance(config.pipeline.model, MMPIModelConfig):
         raise InputError(f"The run of {path} was trained by another method: only those of mmpi can be read.")
-    check_nothing_left(config.pipeline.model)
     return config.pipeline.model
 
 

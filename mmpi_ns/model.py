@@ -63,6 +63,9 @@ class MMPIModelConfig(ModelConfig):
     """Must stay off: a finite far would drop the plane at infinity."""
     eval_num_rays_per_chunk: int = 0
     """Rays in a rendering chunk; 0 chooses for the device (on a GPU: as many as fit in half of its free memory)."""
+    size: float = 1.0
+    """Rays of the training and most texels of the plan, over what the capture's pixels need: 0.3 for a quick look, 4
+    for the best field."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Placement and resolution of the MPIs."""
     plan_file: Path | None = None
@@ -88,11 +91,9 @@ class MMPIModelConfig(ModelConfig):
     """Not an option: the trainer sets it from --machine.seed."""
     total_steps: int = field(default=1, init=False)
     """Not an option: the trainer sets it from --max-num-iterations; the phases are shares of it. 0: as many as the
-    capture needs by the defaults of ``method``."""
+    capture needs."""
     rays_times: int = field(default=1, init=False)
     """Not an option: the trainer sets it; how many times the method's rays a step draws on this GPU."""
-    method: str = field(default="", init=False)
-    """Not an option: the trainer sets it to the name of the method."""
     windows_folder: Path | None = field(default=None, init=False)
     """Not an option: the trainer sets it, and config.yml keeps it for evaluation; where the finished windows lie."""
 
@@ -109,11 +110,10 @@ class MMPIModel(Model):
         """What is known of the training images; None where the plan comes from a checkpoint."""
         capture, device = self.capture, self.kwargs.get("device", "cpu")
         views = None if capture is None else capture.views
-        windows = self._plan(config.placement)
-        if (
-            capture is not None
-        ):  # fewer texels than the rule would like, where they do not fit in the memory that is free
-            joint, placement = self._is_joint(windows), config.placement
+        sized = replace(config.placement, max_texels=config.size * config.placement.max_texels)
+        windows = self._plan(sized)
+        if capture is not None:  # fewer texels than the rule would like, where memory is short
+            joint, placement = self._is_joint(windows), sized
             work = Work(
                 config.colour.feature_channels, not joint, capture.rays_per_step, config.sampling.threshold,
                 all_mpis=not joint and config.schedule.rays_per_mpi == "all",
@@ -154,7 +154,7 @@ class MMPIModel(Model):
         config, capture = self.config, self.capture
         observations = None if capture is None else capture.observations
         if observations is not None and config.total_steps == 0:
-            config.total_steps = steps_for(config.method, most_pixels(observations, placement), config.rays_times)
+            config.total_steps = steps_for(most_pixels(observations, placement), config.size, config.rays_times)
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             return WindowedPlan.load(config.plan_file)
         if capture is None or observations is None:
@@ -221,8 +221,6 @@ class MMPIModel(Model):
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
         present = [*range(trained + 1)]  # finished windows, and the one being trained
-        if self.run.shared:  # other processes train some of them
-            present = [w for w in range(len(windows)) if w == trained or self.store.path(w).is_file()]
 
         def render(place: int, rays: Tensor | slice) -> dict[str, Tensor]:
             window = present[place]

@@ -323,7 +323,7 @@ class Preparation:
             f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
             "bold red" if not is_right else "" if warnings else "green",
         )
-        say(f"ns-train mmpi-small --data {quoted(scene)}")
+        say(f"ns-train mmpi --data {quoted(scene)}")
 
 
 @contextmanager

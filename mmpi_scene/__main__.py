@@ -93,7 +93,7 @@ class SceneCommand:
         if len(sfm.points) < points:
             print(f"  The cameras see no more points well enough, and {points} were asked for.")
         if self.images:
-            print(f"Next: ns-train mmpi-small --data {quoted(self.folder)}")
+            print(f"Next: ns-train mmpi --data {quoted(self.folder)}")
 
 
 def entrypoint() -> None:

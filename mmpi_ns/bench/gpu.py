@@ -108,7 +108,7 @@ def time_training(device: str, data: Path, work: Path) -> dict[str, Any]:
     options = (*drive(64, RAYS), *(word for name in manager for word in (name, "False")), *NO_TRACKS)
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of others' deprecations
-        steps = Steps(train_words("mmpi-small", options, Scene(data, 1), work, 10 * STEPS, 0, device))
+        steps = Steps(train_words("mmpi", options, Scene(data, 1), work, 10 * STEPS, 0, device))
         steps.run(2)  # compiles
         differs = steps.trainer.kernels_differ()
         seconds = steps.run(STEPS) / STEPS

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from mmpi_ns.utils.errors import InputError, brief, looked_at
 from mmpi_ns.utils.files import opened
-from mmpi_ns.utils.host import command
 from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
 FLOAT64_SAME = 1e-12
@@ -43,9 +42,6 @@ PARSER_OPTIONS = {
 }
 """Options that nerfstudio's data parsers have."""
 ORIENTATIONS = ("pca", "up", "vertical", "none")
-
-LOAD_RUNS = ("ns-eval", "ns-render", "ns-viewer", "ns-export", "mmpi-export")
-"""Commands that learn from a run's config.yml where the capture is."""
 
 Frames = Sequence[Mapping[str, Any]]
 POSITIVE = Number(0, above=True)
@@ -123,23 +119,13 @@ def colmap_models(folder: Path) -> list[str]:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    if not path.is_file() and command() in LOAD_RUNS:
-        how = "in the run's config.yml (data, under pipeline.datamanager)"
-        if path.is_absolute():
-            raise InputError(
-                f"There is no {path}, the capture that this run was trained on: put it back, or correct its path {how}."
-            )
-        raise InputError(
-            f"There is no {path} in {Path.cwd()}, and --data of this run is relative to the folder in which ns-train "
-            f"was started: start the command there, or give the whole path {how}."
-        )
     if not path.is_file():
         model = next(iter(colmap_models(path.parent)), "colmap/sparse/0")
         parser = "colmap" if model == "colmap/sparse/0" else f"colmap --colmap-path {model}"
         parser = "blender-data" if (path.parent / "transforms_train.json").is_file() else parser
         raise InputError(
             f"There is no {looked_at(path)}: check --data, make one with mmpi-prepare, or name the data parser of "
-            f"another format after the options (for example: ns-train mmpi-small --data FOLDER {parser})."
+            f"another format after the options (for example: ns-train mmpi --data FOLDER {parser})."
         )
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
@@ -297,7 +283,7 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
         )
     if meta.get("is_fisheye") is True and MODELS[model] != CameraType.FISHEYE:
         raise InputError(
-            f"{path} is of instant-ngp (is_fisheye): name its data parser after the options (ns-train mmpi-small "
+            f"{path} is of instant-ngp (is_fisheye): name its data parser after the options (ns-train mmpi "
             "--data FOLDER instant-ngp-data), or write the camera_model OPENCV_FISHEYE."
         )
     for key in CAMERA:
@@ -305,7 +291,7 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
         if lacking is not None and "camera_angle_x" in meta:
             raise InputError(
                 f"{path} has camera_angle_x and no {key}: name the data parser of instant-ngp after the options "
-                f"(ns-train mmpi-small --data FOLDER instant-ngp-data), or add {key}."
+                f"(ns-train mmpi --data FOLDER instant-ngp-data), or add {key}."
             )
         if lacking is not None:
             raise InputError(f"{path} has no {key}, neither for all frames nor in {cut(lacking['file_path'])}: add it.")

@@ -1,32 +1,16 @@
-"""Options of placement: valid values, and defaults that follow the method and the capture. Quick to import."""
+"""Options of placement: valid values, and defaults that follow the capture. Quick to import."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scene.plan import MOST_PLANES, MOST_TEXELS, MOST_VOXELS
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import Number, check_options, shown
 
-
-@dataclass(frozen=True)
-class Default:
-    """Length of a method's training and its placement, from which the size of texels follows."""
-
-    steps: int
-    """Training steps of a capture of ``FEW`` to ``MANY`` pixels."""
-    least_steps: int
-    """Of one of fewer pixels."""
-    rays: int
-    """Rays of a step."""
-    placement: PlacementConfig
-
-
-DEFAULTS = {
-    "mmpi": Default(20000, 20000, 4096, PlacementConfig(texel_pixels=1.2, max_texels=200e6)),
-    "mmpi-small": Default(4000, 2500, 1024, PlacementConfig(texel_pixels=1.2)),
-}
+STEPS, LEAST_STEPS, RAYS = 4000, 2500, 1024
+"""Training steps of a capture of ``FEW`` to ``MANY`` pixels, of one of fewer pixels, and rays of a step. More rays make
+the field better and images with details no better: they learn single images (docs/ablations.md)."""
+PLACEMENT = PlacementConfig(texel_pixels=1.2)
 FEW, MANY = 2.6e6, 10.4e6
 """Training pixels of a window: below the first steps become fewer in proportion, above the second more."""
 MOST_TIMES = 3.0
@@ -50,18 +34,18 @@ RANGES = {
 FACES = ("front", "left", "right", "below")
 
 
-def rays_times(method: str, processors: int) -> int:
-    """How many times its rays a method with defaults draws in a step, in as many times fewer steps; a power of two.
+def rays_times(processors: int) -> int:
+    """How many times its rays a run with defaults draws in a step, in as many times fewer steps; a power of two.
     ``processors`` are the multiprocessors of the GPU, 0 on a CPU."""
-    fit = RAYS_PER_PROCESSOR * processors // DEFAULTS[method].rays
+    fit = RAYS_PER_PROCESSOR * processors // RAYS
     return min(1 << max(fit, 1).bit_length() - 1, MOST_RAYS_TIMES)
 
 
-def steps_for(method: str, pixels: float, times: int = 1) -> int:
+def steps_for(pixels: float, size: float = 1.0, times: int = 1) -> int:
     """Training steps of a window, in hundreds: fewer for few training pixels, more for many (``FEW``, ``MANY``), in
-    proportion; fewer, too, if a step draws several times the method's rays (``rays_times``)."""
-    default, multiple = DEFAULTS[method], min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES)
-    return 100 * round(max(default.least_steps, default.steps * multiple) / 100) // times
+    proportion; ``size`` times as many, and fewer if a step draws several ``times`` the rays (``rays_times``)."""
+    multiple = min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES)
+    return 100 * max(1, round(size * max(LEAST_STEPS, STEPS * multiple) / 100)) // times
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:

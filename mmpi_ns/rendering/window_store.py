@@ -5,9 +5,9 @@ from __future__ import annotations
 import pickle
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Lock
 from weakref import WeakValueDictionary
 
 import torch
@@ -16,7 +16,6 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import to_text, write_atomically
-from mmpi_ns.utils.host import uninterrupted
 
 _DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
 """Exceptions of reading a damaged file."""
@@ -32,7 +31,9 @@ class WindowStore:
     """Makes a field of the run's settings to load into."""
     budget: float = 0.0
     """Bytes of the windows kept for rendering. The window being rendered is kept in any case."""
-    _lock: Lock = field(default_factory=Lock)
+    _thread: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, "mmpi-windows"))
+    """Reads and evicts windows, one at a time. The viewer stops a rendering by an exception in its own thread, at any
+    line: work that must not be left half-done is done in this one."""
     _held: dict[int, MMPIField] = field(default_factory=dict)
     """Windows in memory, the most recently used last."""
     _alive: WeakValueDictionary[int, MMPIField] = field(default_factory=WeakValueDictionary)
@@ -45,14 +46,12 @@ class WindowStore:
     @property
     def in_memory(self) -> tuple[int, ...]:
         """Windows that can be rendered without reading a file, the most recently used last."""
-        with uninterrupted(), self._lock:
-            return tuple(self._held)
+        return tuple(self._held)
 
     def forget(self, window: int) -> None:
         """Ignores the file from now on: the window is about to be trained and will be written again."""
-        with uninterrupted(), self._lock:
-            self._held.pop(window, None)
-            self._alive.pop(window, None)
+        self._held.pop(window, None)
+        self._alive.pop(window, None)
 
     def save(self, window: int, field: MMPIField) -> None:
         """Writes a finished window atomically. Raises WriteError if the disk is full or cannot be written."""
@@ -71,30 +70,32 @@ class WindowStore:
         Raises:
             InputError: the file is missing or damaged (says which, and what to do).
         """
-        with uninterrupted(), self._lock:
-            field, path = self._alive.get(window), self.path(window)
-            if field is None:
-                if not path.is_file():
-                    raise InputError(
-                        f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' "
-                        "back, or name where it is in config.yml (pipeline.model.windows_folder)."
-                    )
-                try:
-                    state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
-                    needed = sum(x.nbytes for x in state.values())
-                    while self._held and needed + sum(held.nbytes for held in self._held.values()) > self.budget:
-                        del self._held[next(iter(self._held))]  # the least recently used
-                    field = self.empty()
-                    field.load_state_dict(state)
-                except (*_DAMAGED, AttributeError) as error:
-                    raise InputError(
-                        f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it "
-                        "anew, or train it again: resume from a checkpoint of before its end with --load-step."
-                    ) from error
-                field = field.to(device).eval()
-            self._held.pop(window, None)
-            self._held[window] = self._alive[window] = field
-            return field
+        return self._thread.submit(self._load, window, device).result()
+
+    def _load(self, window: int, device: torch.device) -> MMPIField:
+        field, path = self._alive.get(window), self.path(window)
+        if field is None:
+            if not path.is_file():
+                raise InputError(
+                    f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' "
+                    "back, or name where it is in config.yml (pipeline.model.windows_folder)."
+                )
+            try:
+                state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
+                needed = sum(x.nbytes for x in state.values())
+                while self._held and needed + sum(held.nbytes for held in self._held.values()) > self.budget:
+                    del self._held[next(iter(self._held))]  # the least recently used
+                field = self.empty()
+                field.load_state_dict(state)
+            except (*_DAMAGED, AttributeError) as error:
+                raise InputError(
+                    f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it "
+                    "anew, or train it again: resume from a checkpoint of before its end with --load-step."
+                ) from error
+            field = field.to(device).eval()
+        self._held.pop(window, None)
+        self._held[window] = self._alive[window] = field
+        return field
 
     def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
         """Takes over finished windows of the run that this one resumes.

@@ -9,7 +9,6 @@ from typing import Any
 import tyro
 
 from mmpi_ns.utils.errors import used_up
-from mmpi_ns.utils.host import enter_command
 
 
 def say_version(name: str) -> None:
@@ -28,7 +27,6 @@ def run(name: str, command: Any, **how: Any) -> int:
         how: for tyro.
     """
     say_version(name)
-    enter_command()
     try:
         tyro.cli(command, **{"prog": name, **how}).main()
     except (ValueError, OSError) as error:

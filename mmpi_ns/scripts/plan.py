@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from mmpi_ns.placement.defaults import DEFAULTS, check_placement, steps_for
+from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
-from mmpi_ns.scripts.command import say_version
+from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.errors import InputError, looked_at, quoted
-from mmpi_ns.utils.host import enter_command, values_of
 
 if TYPE_CHECKING:
     from mmpi_ns.placement.observations import Observations
@@ -31,15 +31,13 @@ class PlanCommand:
     """Folder with transforms.json, or with images and a COLMAP model."""
     output: Path
     """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window)."""
-    method: Literal["mmpi", "mmpi-small"] = "mmpi-small"
-    """Method whose defaults are used."""
     downscale_factor: int | None = None
     """Size of the images, as for the data parser."""
     parser: Literal["auto", "nerfstudio", "colmap"] = "auto"
     """Format of the scene."""
     plan_file: Path | None = None
     """Evaluate this plan instead of making a new one."""
-    placement: PlacementConfig = field(default_factory=PlacementConfig)
+    placement: PlacementConfig = field(default_factory=lambda: PLACEMENT)
     """The rule's settings."""
 
     def main(self) -> None:
@@ -63,8 +61,8 @@ class PlanCommand:
             )
         observations, manager = load_observations(self.scene, self.downscale_factor, self.parser)
         if windows is None:
-            steps = steps_for(self.method, most_pixels(observations, self.placement))
-            windows = place_windows(observations, self.placement, steps * DEFAULTS[self.method].rays)
+            steps = steps_for(most_pixels(observations, self.placement))
+            windows = place_windows(observations, self.placement, steps * RAYS)
         text = self._explain(windows, observations)
         if manager.priors is not None and manager.priors.movers:
             text += f"\n\n{manager.priors.movers}."
@@ -73,7 +71,7 @@ class PlanCommand:
         table.write_text(f"{title}\n\n{_mark(plan)}\n\n{text}\n", encoding="utf-8")
         print(text)
         print(f"\nWrote plan.json, plan.md and pictures in {self.output}.")
-        print(f"Train with it: ns-train {self.method} --pipeline.model.plan-file {quoted(plan)} --data ...")
+        print(f"Train with it: ns-train mmpi --pipeline.model.plan-file {quoted(plan)} --data ...")
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
         """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""
@@ -106,13 +104,7 @@ def _mark(plan: Path) -> str:
 
 def entrypoint() -> None:
     """The command ``mmpi-plan``; a problem with the scene or the plan ends it with one sentence and status 1."""
-    say_version("mmpi-plan")
-    method = next(iter(values_of("--method")), "mmpi-small")
-    usual = DEFAULTS.get(method, DEFAULTS["mmpi-small"]).placement
-    default = PlanCommand(tyro.MISSING, tyro.MISSING, placement=usual)
-    command = tyro.cli(PlanCommand, default=default, description=PlanCommand.__doc__)
-    enter_command()
-    command.main()
+    sys.exit(run("mmpi-plan", PlanCommand, description=PlanCommand.__doc__))
 
 
 if __name__ == "__main__":

@@ -24,13 +24,11 @@ LEAST_SECONDS, MOST_SECONDS = 2.0, 30.0
 VIEWS, LOOK_SECONDS = 4, 20.0
 """The quick test: maximum number of test images, and seconds after which no further one is started."""
 CPU_RAYS = 15000.0
-"""Pixel rays/s that one core trains with the settings of mmpi-small: 21,000 on kitti-street at a quarter, 12,000 on
+"""Pixel rays/s that one core trains with its defaults: 21,000 on kitti-street at a quarter, 12,000 on
 kitchen at a half (one core of an Intel Xeon)."""
 ONE_THREAD = 0.6
 """Share of a training that runs on one thread: 1,500 steps of kitti-street /4 took 78 s with one thread, 62 s with two
 on two free cores (docs/log/performance.md)."""
-LONG = 1800.0
-"""Seconds from which a smaller method is suggested."""
 
 
 @dataclass(eq=False)
@@ -72,14 +70,13 @@ class TrainingLog:
         self._said_at, self._said, self._phase = now, done, where
 
 
-def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> str:
-    """Training time on this machine's CPU, the smaller method if that is long, and a warning if threads wait for cores:
-    for a run of ``steps`` with ``rays`` each, given its threads and the free cores."""
+def forecast(steps: int, rays: int, threads: int, cores: float) -> str:
+    """Training time of ``steps`` of ``rays`` each on this machine's CPU, and a warning if ``threads`` outnumber the free
+    ``cores``."""
     together = max(1.0, min(threads, cores))
     seconds = steps * rays / CPU_RAYS * (ONE_THREAD + (1 - ONE_THREAD) / together)
-    smaller = "; mmpi-small is made for a CPU" if seconds > LONG and method != "mmpi-small" else ""
     work = f"{steps:,} steps of {rays:,} rays"
-    text = f"Without a GPU, {work} take about {duration(seconds)}, or more with large plans{smaller}."
+    text = f"Without a GPU, {work} take about {duration(seconds)}, or more with large plans."
     if threads > 1 and cores < threads - 0.5:
         text += (
             f"\n{threads} threads run and {cores:.1f} cores are free, so they wait for each other: end other programs, "

@@ -1,20 +1,14 @@
 """State of a training run, and its changes between two steps: window, resolution, bricks, pixels, what trains.
 
-Also the rays of a batch, which move with the poses that are refined; and the windows of a long capture, shared among
-processes, which exchange nothing: each trains every n-th window, and waits for the others at the end
-(docs/how_it_works.md, "Windows").
+Also the rays of a batch, which move with the poses that are refined.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import timedelta
-from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
@@ -29,16 +23,11 @@ from mmpi_ns.placement.split import cameras_of
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
-from mmpi_ns.training.checkpoints import checkpoints_in
 from mmpi_ns.training.initial import start_from_depths
 from mmpi_ns.training.phases import TRAINS, Schedule
 from mmpi_ns.training.storage import prepare_storage
-from mmpi_ns.utils.errors import say
 from mmpi_ns.utils.files import to_bytes, to_text
 
-PATIENCE = timedelta(days=7)
-"""How long processes with less work wait for the others; nerfstudio's time out after half an hour. If one dies,
-torchrun ends the run at once."""
 WINDOWS_FOLDER = "windows"
 
 
@@ -142,8 +131,6 @@ class TrainingRun:
     """Corrections of the cameras' poses, if they are refined."""
     scale_is_free: bool
     """No depth measurement fixes the scale of the capture."""
-    shared: bool = False
-    """Whether other processes train some of the windows."""
     _drawn_from: int | None = None
 
     def parameters(self) -> dict[str, list[Parameter]]:
@@ -195,42 +182,3 @@ class TrainingRun:
             params[0].requires_grad_(kind in TRAINS[phase])
         if "camera_opt" in TRAINS[phase] and self.poses and self.views is not None:
             keep_frame(self.poses[0], self.views.origins, field.plan.content_near, self.scale_is_free)
-
-
-class WindowShare:
-    """The windows of one process of several.
-
-    Args:
-        rank: number of this process.
-        processes: all of them.
-        folders: with checkpoints: of this run, and of the run that it resumes.
-    """
-
-    def __init__(self, rank: int, processes: int, folders: list[Path]) -> None:
-        self.rank, self.processes, self.folders = rank, processes, folders
-        self._group: dist.ProcessGroup | None = None
-        if dist.is_initialized() and dist.get_backend() != "gloo":  # under torchrun scripts.train waits
-            group = dist.new_group(backend="gloo", timeout=PATIENCE)
-            assert isinstance(group, dist.ProcessGroup)
-            self._group = group
-
-    def checkpoints_of(self, steps: range) -> dict[int, Path]:
-        """Checkpoints of a window's steps, of this run and of the resumed one."""
-        return {step: path for folder in self.folders for step, path in checkpoints_in(folder, steps).items()}
-
-    def unfinished(self, progress: Progress, store: WindowStore) -> Iterator[int]:
-        """Windows that this process still has to train; takes over the files that the resumed run finished. Ends when
-        all processes have trained theirs."""
-        windows = progress.windows
-        for window in range(self.rank, len(windows), self.processes):
-            for folder in self.folders[1:]:
-                store.adopt(folder.parent / WINDOWS_FOLDER, {window: windows.plans[window]})
-            # The last window needs its checkpoint too, because evaluation loads it.
-            steps = progress.schedule.steps_of(window)
-            whole = window != len(windows) - 1 or steps[-1] in self.checkpoints_of(steps)
-            if store.path(window).is_file() and whole:
-                say(f"Window {window} is finished already.")
-            else:
-                yield window
-        if self._group is not None:
-            dist.barrier(group=self._group)

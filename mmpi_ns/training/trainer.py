@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,16 +14,15 @@ from typing import Any, Literal, NoReturn, cast
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils import comms, writer
+from nerfstudio.utils import writer
 
-from mmpi_ns.data.checks import LOAD_RUNS
 from mmpi_ns.data.datamanager import MMPIDataManager
 from mmpi_ns.data.dataset import image_and_mask
 from mmpi_ns.ops import dispatch
-from mmpi_ns.placement.defaults import DEFAULTS, rays_times
+from mmpi_ns.placement.defaults import RAYS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
 from mmpi_ns.rendering.pipeline import MMPIPipeline
-from mmpi_ns.rendering.rendered import BACKGROUNDS, bounded
+from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.agreement import RAYS as AGREEMENT_RAYS
@@ -41,12 +40,12 @@ from mmpi_ns.training.checkpoints import (
 )
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.options import check_command, check_nothing_left, check_run
+from mmpi_ns.training.options import check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
-from mmpi_ns.training.run import WINDOWS_FOLDER, TrainingRun, WindowShare, cameras_of, views_of
+from mmpi_ns.training.run import WINDOWS_FOLDER, TrainingRun, cameras_of, views_of
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
-from mmpi_ns.utils.host import command, discard, enter_command, signals_go_to, values_of
+from mmpi_ns.utils.host import discard, keep_freed_memory, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
 from mmpi_ns.utils.random_draws import generator
@@ -59,44 +58,7 @@ class MMPITrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: MMPITrainer)
     max_num_iterations: int = 0
     """Steps of the whole run, resumed or not; if a long capture is split into windows, of each window. 0: as many as
-    its pixels need (mmpi-small: 2,500 to 12,000; docs/captures.md)."""
-
-    def set_timestamp(self) -> None:
-        """The first code of this package that ns-train runs."""
-        enter_command()
-        super().set_timestamp()
-
-    def get_checkpoint_dir(self) -> Path:
-        """The first code of this package that ns-eval, ns-render and ns-viewer run.
-
-        They take every file in this folder for a checkpoint, so the last one is given explicitly. Where a run was moved
-        and the folder that its config.yml names is gone, checkpoints and windows are looked for beside that file.
-        """
-        enter_command()
-        model, folder = cast(Any, self.pipeline.model), super().get_checkpoint_dir()
-        check_nothing_left(model)
-        check_command()
-        if command() == "ns-render":
-            manager: Any = self.pipeline.datamanager
-            manager.backdrop = BACKGROUNDS[model.rendering.background]
-        for config_file in values_of("--load-config") if command() in LOAD_RUNS and not folder.is_dir() else ():
-            moved = Path(config_file).absolute().parent / self.relative_model_dir
-            if moved.is_dir():
-                folder, model.windows_folder = moved, moved.parent / model.windows_folder.name
-        steps = checkpoints_in(folder)
-        if steps and self.load_dir in (None, folder) and self.load_step is None and self.load_checkpoint is None:
-            self.load_step = max(steps)
-            read_checkpoint(steps[self.load_step])
-        return folder
-
-    def get_base_dir(self) -> Path:
-        """The folder of the run. The last code of this package before ns-viewer opens its server.
-
-        ns-viewer takes the address from its own options, whose default is every address of the machine.
-        """
-        if command() == "ns-viewer" and not values_of("--viewer.websocket-host"):
-            self.viewer.websocket_host = "127.0.0.1"
-        return super().get_base_dir()
+    its pixels need (2,500 to 12,000, times --pipeline.model.size)."""
 
     def print_to_terminal(self) -> None:
         """Prints where all settings are, which are more than a terminal has lines."""
@@ -109,8 +71,7 @@ class MMPITrainerConfig(TrainerConfig):
         not which checkpoint this run resumes from, which they must not load.
         """
         check_run(self)
-        if comms.get_world_size() == 1:  # processes that share windows look for those of each
-            checkpoint_to_load(self)
+        checkpoint_to_load(self)
         folder = self.get_base_dir()
         claim(folder, self.get_checkpoint_dir(), self.load_checkpoint or self.load_dir)
         written = copy.deepcopy(self)
@@ -132,10 +93,9 @@ class MMPITrainer(Trainer):
     # Before the first step ----------------------------------------------------------------------------------------
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Prepares the run; a signal during this time ends it with a sentence (of several processes: torchrun's)."""
+        """Prepares the run; a signal during this time ends it with a sentence."""
         # Images are shared among threads; those of the libraries would only spin between small operations.
-        with signals_go_to(_end) if self.world_size == 1 else nullcontext(), one_thread_each():
-            enter_command(training=True)
+        with signals_go_to(_end), one_thread_each():
             if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
                 torch.cuda.set_device(self.local_rank)
             self._stopped_by: int | None = None
@@ -146,41 +106,27 @@ class MMPITrainer(Trainer):
             model_config: Any = config.pipeline.model
             model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
             model_config.total_steps = config.max_num_iterations
-            model_config.method, self._follows_capture = config.method_name, config.max_num_iterations == 0
+            self._follows_capture = config.max_num_iterations == 0
             model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
             # More rays a step on a large GPU, in as many fewer steps, where neither was asked for.
             manager: Any = config.pipeline.datamanager
-            method, rays = str(model_config.method), manager.train_num_rays_per_batch
-            asked = values_of("--pipeline.datamanager.train-num-rays-per-batch")
-            may_change = self._follows_capture and not asked and str(self.device).startswith("cuda")
-            if may_change and rays == DEFAULTS[method].rays:
+            on_gpu = str(self.device).startswith("cuda")
+            if self._follows_capture and on_gpu and manager.train_num_rays_per_batch == RAYS:
                 processors = torch.cuda.get_device_properties(self.device).multi_processor_count
-                model_config.rays_times = times = rays_times(method, processors)
-                manager.train_num_rays_per_batch, manager.keypoint_rays = times * rays, times * manager.keypoint_rays
-            self._share: WindowShare | None = None
-            if self.world_size > 1:
-                folders = [self.checkpoint_dir, *([config.load_dir] if config.load_dir else [])]
-                self._share = WindowShare(comms.get_rank(), self.world_size, folders)
-                # Processes share the windows; nerfstudio would make them average their gradients.
-                self.world_size, config.load_dir = 1, None
+                model_config.rays_times = times = rays_times(processors)
+                manager.train_num_rays_per_batch, manager.keypoint_rays = times * RAYS, times * manager.keypoint_rays
             self._says_lines, config.logging.local_writer.enable = config.logging.local_writer.enable, False
             super().setup(test_mode)
             config.max_num_iterations = self._window_steps
             plan = self._run.progress.windows
             self.base_dir.mkdir(parents=True, exist_ok=True)
             write_plan(self.base_dir / PLAN_FILE, plan)
-            self._run.shared = self._share is not None
             if len(self._run.field.density) <= BRICK:  # the empty brick alone
                 raise InputError(
                     "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face "
                     "as they do (mmpi-plan shows where)."
                 )
             self._announce(plan)
-            if self._share is not None and len(plan) < self._share.processes:
-                raise InputError(
-                    f"The capture has {len(plan)} window(s), too few to share out among {self._share.processes} "
-                    "processes: start fewer, or make windows shorter with --pipeline.model.placement.window-length."
-                )
 
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
@@ -199,7 +145,7 @@ class MMPITrainer(Trainer):
             )
         if not str(self.device).startswith("cuda"):
             rays = self._manager.get_train_rays_per_batch()
-            say(forecast(self.config.method_name or "", self._total_steps, rays, num_threads(), free_cores()))
+            say(forecast(self._total_steps, rays, num_threads(), free_cores()))
             if gpu := unused_gpu():
                 say(f"No GPU is used: {gpu}.")
 
@@ -226,12 +172,6 @@ class MMPITrainer(Trainer):
 
     def train(self) -> None:
         """Runs max-num-iterations in total (a window); nerfstudio 1.1.5 would run as many again after a resume."""
-        if self._share is not None:
-            for window in self._share.unfinished(self._run.progress, self._run.store):
-                self.train_window(window)
-            if self._share.rank == 0:
-                self._write_details(self._total_steps - 1)
-            return
         if self._start_step >= self._total_steps:
             # A finished run lacks its details where it was stopped meanwhile.
             self._last_step = self._start_step - 1
@@ -262,20 +202,6 @@ class MMPITrainer(Trainer):
                 f"command with --load-dir {quoted(self.checkpoint_dir)} continues from there.",
             )
 
-    def train_window(self, window: int) -> None:
-        """Trains one window of several, from where the resumed run left it."""
-        steps = self._run.progress.schedule.steps_of(window)
-        checkpoints = {} if self._share is None else self._share.checkpoints_of(steps)
-        self._start_step = steps.start
-        if checkpoints:
-            self.config.load_checkpoint = checkpoints[max(checkpoints)]
-            self._load_checkpoint()
-            self.config.load_checkpoint = None
-        self._train_until(steps.stop)
-        if window != len(self._run.progress.windows) - 1:  # its file is all that is needed of it
-            for path in checkpoints_in(self.checkpoint_dir, steps).values():
-                path.unlink()
-
     def _train_until(self, end: int) -> None:
         """Trains from the first step to that before ``end``."""
         self._last_step = self._start_step - 1
@@ -284,7 +210,7 @@ class MMPITrainer(Trainer):
         schedule = self._run.progress.schedule
         self._log = TrainingLog(schedule, rays, self._start_step, end) if self._says_lines else None
         try:
-            with torch_apart():
+            with torch_apart(), keep_freed_memory():
                 super().train()
         finally:
             self.config.max_num_iterations = self._window_steps
@@ -329,7 +255,7 @@ class MMPITrainer(Trainer):
         self.training_state = "completed"
         self.save_checkpoint(self.step)
         writer.write_out_storage()
-        if self._stopped_by is not None or self._share is not None:
+        if self._stopped_by is not None:
             return
         self._complete()
         if not self.config.viewer.quit_on_train_completion:
@@ -387,9 +313,7 @@ class MMPITrainer(Trainer):
         state = {"step": step, **parts, **states_of(*models, goes_on=step + 1 < self._total_steps)}
         write_atomically(path, lambda p: torch.save(state, p), self.base_dir)
         if self.config.save_only_latest_checkpoint:
-            progress = self._run.progress  # checkpoints of other windows are other processes' work
-            steps = None if self._share is None else progress.schedule.steps_of(progress.window)
-            for old in checkpoints_in(self.checkpoint_dir, steps).values():
+            for old in checkpoints_in(self.checkpoint_dir).values():
                 if old != path:
                     old.unlink()
 
@@ -407,7 +331,7 @@ class MMPITrainer(Trainer):
         asked_for, self.config.load_checkpoint = self.config.load_checkpoint, path
         super()._load_checkpoint()
         self.config.load_dir, self.config.load_checkpoint = asked, asked_for
-        if path is not None and self._share is None:
+        if path is not None:
             progress = run.progress
             finished = dict(enumerate(progress.windows.plans[: progress.schedule.window_at(self._start_step)]))
             run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from PIL import Image
 
 from mmpi_ns.utils.errors import InputError, WriteError, brief
-from mmpi_ns.utils.host import command
 
 if TYPE_CHECKING:
     from jaxtyping import UInt8
@@ -45,11 +44,9 @@ def write_atomically(path: Path, write: Callable[[Path], object], folder: Path |
     except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError, without a reason, for a full disk
         free = shutil.disk_usage(temporary.parent).free / 2**20
         temporary.unlink(missing_ok=True)
-        of_ours = (command() or "").startswith("mmpi-")  # which train nothing
-        further = "" if of_ours else " (--load-dir goes on from the last checkpoint)"
         raise WriteError(
             f"{path} could not be written ({brief(error)}; {free:.0f} MB free): earlier files are "
-            f"untouched, so make room and start again{further}."
+            f"untouched, so make room and start again."
         ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)

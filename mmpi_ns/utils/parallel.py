@@ -2,64 +2,41 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import ClassVar, TypeVar
+from functools import cache
+from typing import TypeVar
 
 import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
-from mmpi_ns.utils.host import uninterrupted
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class _Apart:
-    """State of ``torch_apart`` in this process, whose threads share it: a viewer renders beside the training."""
-
-    lock = threading.Lock()
-    blocks: ClassVar[set[object]] = set()
-    threads = 0
-
-
+@cache
 def num_threads() -> int:
-    """Threads that share the work of this package: as many as torch uses, or used before ``torch_apart``."""
-    return _Apart.threads if _Apart.blocks else torch.get_num_threads()
+    """Threads that share the work of this package: as many as torch used when this was first asked for."""
+    return torch.get_num_threads()
 
 
 @contextmanager
 def torch_apart() -> Iterator[None]:
-    """Within the block torch's own operations take one thread, and ``num_threads`` stays what it was.
+    """Within the block torch's own operations take one thread.
 
     OpenMP's threads wait for torch's next operation spinning, for milliseconds, on the cores that the compiled kernels
     of this package would use. The arrays of a training step and of a picture are too small for torch's threads to pay.
     """
-    block = object()
+    num_threads()  # of before
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     try:
-        try:
-            with uninterrupted(), _Apart.lock:
-                # A thread that began within a block keeps torch's one thread after it.
-                _Apart.threads = max(_Apart.threads, torch.get_num_threads())
-                _Apart.blocks.add(block)
-                torch.set_num_threads(1)
-            yield
-        finally:
-            _leave(block)
-    finally:  # A viewer's trace function, which raises once, may raise before the first line of _leave.
-        _leave(block)
-
-
-def _leave(block: object) -> None:
-    with uninterrupted(), _Apart.lock:
-        if block in _Apart.blocks:
-            _Apart.blocks.remove(block)
-            if not _Apart.blocks:
-                torch.set_num_threads(_Apart.threads)
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @contextmanager

@@ -12,20 +12,20 @@ from PIL import Image
 from procedural import observations_of
 
 from mmpi_ns.config import mmpi, mmpi_small
-from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.observations import find_visible_points
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.placement.show import describe_facing, explain, table
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.plan import PlanCommand, entrypoint
-from mmpi_ns.utils.errors import InputError
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 
 
 def run(monkeypatch, *words):
     monkeypatch.setattr(sys, "argv", ["mmpi-plan", *map(str, words)])
-    entrypoint()
+    with pytest.raises(SystemExit) as ended:
+        entrypoint()
+    return ended.value.code
 
 
 def test_it_writes_a_plan_a_table_and_pictures(scene, tmp_path, monkeypatch, capsys):
@@ -43,10 +43,10 @@ def test_the_plan_is_that_of_training(scene, tmp_path, monkeypatch):
     run(monkeypatch, scene, "--output", tmp_path / "plan", "--placement.max-texels", 1e5)
     config = copy.deepcopy(mmpi_small.config.pipeline)
     config.datamanager.data = scene
-    config.model.method, config.model.total_steps, config.model.lpips_net = "mmpi-small", 0, "none"  # as the trainer
+    config.model.total_steps, config.model.lpips_net = 0, "none"  # as the trainer
     config.model.placement.max_texels = 1e5
     pipeline = config.setup(device="cpu", test_mode="val")
-    assert pipeline.datamanager.depth_priors.share > 0.1
+    assert pipeline.datamanager.priors.depths.share > 0.1
     assert pipeline.model.progress.windows == WindowedPlan.load(tmp_path / "plan" / "plan.json")
 
 
@@ -62,22 +62,16 @@ def test_an_edited_plan_is_explained_and_kept(scene, tmp_path, monkeypatch, caps
     )
 
 
-def test_the_defaults_are_those_of_the_method(tmp_path, monkeypatch):
+def test_the_defaults_are_those_of_training(tmp_path, monkeypatch):
     commands = []
     monkeypatch.setattr(PlanCommand, "main", lambda command: commands.append(command))
-    for name, method in (("mmpi", mmpi), ("mmpi-small", mmpi_small)):
-        for words in (["scene", "--method", name], [f"--method={name}", "scene"]):
-            run(monkeypatch, *words, "--output", tmp_path)
-            assert commands[-1].placement == method.config.pipeline.model.placement
-            rays = method.config.pipeline.datamanager.train_num_rays_per_batch
-            assert DEFAULTS[name].rays == rays
-    run(monkeypatch, "scene", "--output", tmp_path)
-    assert commands[-1].placement == mmpi_small.config.pipeline.model.placement
+    assert not run(monkeypatch, "scene", "--output", tmp_path)
+    assert commands[-1].placement == mmpi.config.pipeline.model.placement
 
 
-def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="There is no scene at"):
-        run(monkeypatch, tmp_path / "nowhere", "--output", tmp_path / "plan")
+def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch, capsys):
+    assert run(monkeypatch, tmp_path / "nowhere", "--output", tmp_path / "plan") == 1
+    assert "There is no scene at" in capsys.readouterr().err
     assert not (tmp_path / "plan").exists()
 
 

@@ -53,23 +53,17 @@ def test_durations_are_in_words():
     assert [duration(s) for s in (3.2, 89, 641, 12600)] == ["3 s", "89 s", "11 min", "3.5 h"]
 
 
-def test_a_long_run_without_a_gpu_names_the_smaller_method():
-    alone = report.forecast("mmpi", 20000, 4096, 1, 1.0)
-    assert f"{20000 * 4096 / report.CPU_RAYS / 3600:.1f} h" in alone and "mmpi-small" in alone
-    assert "mmpi-small" not in report.forecast("mmpi-small", 20000, 4096, 1, 1.0)
-
-
 def test_more_threads_help_with_what_is_parallel_alone():
     for threads, share in ((2, 0.8), (16, 0.6 + 0.4 / 16)):
-        assert f"about {100 * share:.1f} h" in report.forecast("mmpi", 360_000, int(report.CPU_RAYS), threads, 16.0)
+        assert f"about {100 * share:.1f} h" in report.forecast(360_000, int(report.CPU_RAYS), threads, 16.0)
 
 
 def test_threads_that_wait_for_cores_are_told():
-    assert "free" not in report.forecast("mmpi", 10, 10, 8, 7.8)
-    assert "free" not in report.forecast("mmpi", 10, 10, 1, 0.2), "nothing would mend it"
-    busy = report.forecast("mmpi", 10, 10, 8, 2.1)
+    assert "free" not in report.forecast(10, 10, 8, 7.8)
+    assert "free" not in report.forecast(10, 10, 1, 0.2), "nothing would mend it"
+    busy = report.forecast(10, 10, 8, 2.1)
     assert "8 threads run and 2.1 cores are free" in busy and "OMP_NUM_THREADS=2" in busy
-    assert report.forecast("mmpi", 10**6, 10, 8, 2.0).split("\n")[0] == report.forecast("mmpi", 10**6, 10, 2, 2.0)
+    assert report.forecast(10**6, 10, 8, 2.0).split("\n")[0] == report.forecast(10**6, 10, 2, 2.0)
 
 
 def test_free_cores_are_those_that_are_idle_within_what_the_process_may_use(monkeypatch, tmp_path):

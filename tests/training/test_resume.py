@@ -11,9 +11,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from training_runs import compared, differences, load, ready, trainer_config, write_plan
 
 from mmpi_ns.field.tables import in_half_precision
-from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.utils.errors import InputError
 
 STEPS = 24
 """individual 0-11 with doublings at 2 and 3 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
@@ -291,33 +289,10 @@ def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning
     assert state["optimizers"]["density"]["state"], "this run goes on, and its moments with it"
 
 
-def test_a_run_of_a_device_that_draws_more_rays_is_resumed_with_its_rays_and_steps(
-    scene, plan_file, tmp_path, monkeypatch
-):
-    """A GPU that draws four times the rays in a quarter of the steps is faked; the run goes on on a CPU."""
-    monkeypatch.setitem(DEFAULTS, "mmpi-small", replace(DEFAULTS["mmpi-small"], steps=100, least_steps=100))
-    config = trainer_config(scene, plan_file, tmp_path / "gpu", steps=0)
-    manager = config.pipeline.datamanager
-    few = manager.train_num_rays_per_batch, manager.keypoint_rays
-    many = 4 * few[0], 4 * few[1]
-    manager.train_num_rays_per_batch, manager.keypoint_rays, config.pipeline.model.rays_times = *many, 4
-    begun = ready(config)
-    begun.save_checkpoint(3)
-    with pytest.raises(InputError) as error:
-        ready(trainer_config(scene, plan_file, tmp_path / "cpu", steps=0), load_dir=begun.checkpoint_dir)
-    options = "--max-num-iterations 25 --pipeline.datamanager.train-num-rays-per-batch {} --pipeline.datamanager."
-    assert "run of 25 steps of 256 rays, and 64 a step suit this device" in str(error.value)
-    assert options.format(many[0]) + f"keypoint-rays {many[1]}." in str(error.value)
-    config = trainer_config(scene, plan_file, tmp_path / "cpu", steps=25)
-    manager = config.pipeline.datamanager
-    manager.train_num_rays_per_batch, manager.keypoint_rays = many
-    resumed = ready(config, load_dir=begun.checkpoint_dir)
-    assert resumed.pipeline.model.progress.schedule.total_steps == 25 and resumed._start_step == 4
-
-
 @pytest.mark.parametrize("steps", [0, 150])
 def test_without_a_number_of_steps_they_follow_the_pixels(scene, plan_file, tmp_path, monkeypatch, capsys, steps):
-    monkeypatch.setitem(DEFAULTS, "mmpi-small", replace(DEFAULTS["mmpi-small"], steps=100, least_steps=100))
+    monkeypatch.setattr("mmpi_ns.placement.defaults.STEPS", 100)
+    monkeypatch.setattr("mmpi_ns.placement.defaults.LEAST_STEPS", 100)
     monkeypatch.setattr("mmpi_ns.placement.defaults.FEW", 1.0)
     monkeypatch.setattr("mmpi_ns.placement.defaults.MANY", 1.0)
     config = trainer_config(scene, plan_file, tmp_path, steps=steps)
