@@ -23,7 +23,7 @@ from mmpi_ns.data.datamanager import DEPTHS_KNOWN, GAINS, OBSERVATIONS, RAYS_PER
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.ops.march import Capacity, MarchOptions
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
@@ -52,7 +52,7 @@ from mmpi_ns.training.phases import TRAINS, ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
-from mmpi_ns.utils.random_draws import generator
+from mmpi_ns.utils.random_draws import Generators
 
 
 @dataclass
@@ -129,6 +129,12 @@ class MMPIModel(Model):
         self.exposures = Exposures(metadata.get(GAINS), None if views is None else views.origins)
         self.details: Details | None = None
         self.metrics = ImageMetrics(config.lpips_net)
+        self.draws = Generators(config.seed, device)
+        self.capacity: Capacity | None = None
+        """Of a training batch on a GPU; None: as many samples as there are."""
+        self.register_buffer("decay", torch.tensor(1.0), persistent=False)
+        """``Schedule.decay`` of the step."""
+        self.decay: Tensor
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
         """In place of ``scores_and_images`` while the pipeline evaluates images, which are exact then."""
         self.show = ViewerDropdown("Show MPI", "all", ["all"], hint="One MPI alone, or all")
@@ -203,7 +209,7 @@ class MMPIModel(Model):
         if phase == "individual" and num_mpis > 1:
             # Rays for one of the MPIs that they meet, or for every MPI in turn, and for the cube (paper sec. III-C).
             if self.config.schedule.rays_per_mpi == "split":
-                g = generator(self.config.seed, progress.step, "assignment", self.device)
+                g = self.draws.of(progress.step, "assignment")
                 choose = torch.rand(asked, num_mpis, generator=g, device=self.device)
             else:
                 heads = torch.arange(num_mpis, device=self.device).repeat_interleave(asked)
@@ -212,6 +218,7 @@ class MMPIModel(Model):
                 bundle = bundle.broadcast_to((num_mpis, asked)).flatten()
         blends = "reliability" in TRAINS[phase] and self.blends(field)
         options = self.config.sampling.options(field.plan, not progress.schedule.sharpened(progress.step), blends)
+        options = options._replace(capacity=self.capacity)
         rays = render_rays(bundle, field, options, head_mask, choose)
         return {"training": replace(rays, times=len(bundle) // asked)}
 
@@ -328,9 +335,11 @@ class MMPIModel(Model):
         if "training" not in outputs:  # an evaluation batch during training
             return {"rgb_loss": photometric(outputs["rgb"], self.observed(batch))}
         rays, image, step = outputs["training"], batch["image"].to(self.device), self.progress.step
-        g, weight = generator(self.config.seed, step, "background", self.device), self.config.loss
-        weight = replace(weight, known_depth=weight.known_depth * self.progress.schedule.decay(step))
-        total, errors = batch_losses(rays, self.field, image, weight, g, step)
+        g, decay = self.draws.of(step, "background"), self.progress.schedule.decay(step)
+        if not self.draws.recording:
+            self.decay.fill_(decay)
+        held = self.decay if dispatch.on_gpu(self.decay) else decay
+        total, errors = batch_losses(rays, self.field, image, self.config.loss, g, step, held)
         if rays.lookup is not None and self.progress.schedule.watches(step):
             self.field.note_use(rays.lookup, rays.composite.weights, rays.samples.live, errors)
         self.camera_optimizer.get_loss_dict(total)

@@ -157,7 +157,10 @@ class MMPIField(TexelTables):
         return out.view(lookup.shape), lookup
 
     def _lookup(self, rays: RayBundle, samples: MergedSamples) -> Lookup:
-        index, heads, planes, ndc, counts = order_by_head(samples.places, len(self.grids), samples.head_counts)
+        room = samples.capacity
+        index, heads, planes, ndc, counts = order_by_head(
+            samples.places, len(self.grids), samples.head_counts, room is not None
+        )
         if rays.origins.requires_grad or rays.directions.requires_grad:
             of_rays, inverse_t = index // samples.valid.shape[1], samples.inverse_t.reshape(-1)[index]
             ndc = moving(self.layout, rays.origins, rays.directions, of_rays, heads, planes, inverse_t, ndc)
@@ -167,12 +170,17 @@ class MMPIField(TexelTables):
             parts.append(texel_rows(self.layout, heads[:in_mpis], planes[:in_mpis], ndc[:in_mpis]))
         if in_mpis < len(index):
             parts.append(self.grids[-1].trilinear(ndc[in_mpis:]))
+        if room is not None:  # what no sample fills reads the empty brick
+            filled = samples.valid.reshape(-1)[index].split([len(rows) for rows, _ in parts])
+            empty = torch.arange(len(index), device=index.device).remainder(BRICK).split([len(x) for x in filled])
+            columns = zip(filled, parts, empty, strict=True)
+            parts = [(torch.where(here[:, None], rows, none[:, None]), w) for here, (rows, w), none in columns]
         rows = [rows.reshape(-1) for rows, _ in parts] or [heads]
-        distinct = index_rows(torch.cat(rows), len(self.density))
+        distinct = index_rows(torch.cat(rows), len(self.density), most=None if room is None else room.rows)
         positions = distinct.positions.split([len(r) for r in rows])
         taps = [Taps(p.view(w.shape), w) for p, (_, w) in zip(positions, parts)]  # noqa: B905
         read = (distinct.unique, *(read_rows(table, distinct.unique) for table in (self.density, self.features)))
-        return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read)
+        return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read, distinct.count)
 
     def get_outputs(  # type: ignore[override]
         self,

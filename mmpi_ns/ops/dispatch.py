@@ -141,6 +141,11 @@ def operations() -> dict[str, Operation[..., Any]]:
     return _OPERATIONS
 
 
+def on_gpu(x: Tensor) -> bool:
+    """Whether the kernels of a GPU take a tensor: nothing may be waited for then."""
+    return x.is_cuda or interpreting
+
+
 def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
     for x in values:
         if isinstance(x, Tensor):
