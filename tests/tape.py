@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_map_only
 
 
 class Tape(TorchDispatchMode):
@@ -18,9 +19,10 @@ class Tape(TorchDispatchMode):
         kwargs = kwargs or {}
         made = func(*args, **kwargs)
         if not (self.paused or func.is_view):
-            self.done.append((func, args, kwargs, made))
+            self.done.append((func, *(tree_map_only(torch.Tensor, lambda x: x.detach(), y) for y in (args, kwargs, made))))
         return made
 
+    @torch.no_grad()
     def replay(self) -> None:
         for func, args, kwargs, made in self.done:
             again = func(*args, **kwargs)

@@ -19,6 +19,7 @@ from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
 from mmpi_ns.field.tables import Lookup, TexelTables
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
+from mmpi_ns.ops.dispatch import on_gpu
 from mmpi_ns.ops.gather import RaySums, Taps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
@@ -211,7 +212,7 @@ class MMPIField(TexelTables):
         for k, here, part in lookup.by_head(lookup.read(lookup.features)):
             index = lookup.index[here]
             of_samples = (part, lookup.ndc[here], index // lookup.shape[1], index)
-            if chosen is not None and not chosen.is_cuda:  # a GPU would be waited for
+            if chosen is not None and not on_gpu(chosen):  # a GPU would be waited for
                 kept = chosen[of_samples[2]].nonzero()[:, 0]
                 of_samples = tuple(x.index_select(0, kept) for x in of_samples)
             values, ndc, numbers, index = of_samples
