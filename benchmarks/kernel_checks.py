@@ -205,9 +205,7 @@ def run_checks(device: str, rehearse: bool) -> dict[str, Any]:
         RuntimeError: the kernels are not there to be checked.
     """
     one = torch.zeros(1, device=device)
-    missing = [
-        n for n, of in dispatch.operations().items() if "gpu" in of.compiled and dispatch.form_of(n, one) != "gpu"
-    ]
+    missing = [n for n, of in dispatch.OPERATIONS.items() if "gpu" in of.compiled and dispatch.form_of(n, one) != "gpu"]
     if missing:
         raise RuntimeError(f"there are no kernels to be checked for {', '.join(missing)} (the log says why)")
     size, rows = 500 if rehearse else 200_000, list[dict[str, Any]]()

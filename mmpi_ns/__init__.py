@@ -1,7 +1,7 @@
 """MMPI: radiance fields of several multi-plane images, for nerfstudio's commands and as functions.
 
-``scene = mmpi_ns.load(path)`` reads a run or a baked scene, ``mmpi_ns.render(scene, camera_to_worlds, intrinsics,
-width, height)`` renders images of it (``functional.py``).
+``scene = mmpi_ns.load(path)`` reads a run, and ``mmpi_ns.render(scene, camera_to_worlds, intrinsics, width, height)``
+renders images of it (``functional.py``).
 """
 
 from __future__ import annotations

@@ -1,29 +1,29 @@
-"""Trained scenes as functions: ``load`` a run or a baked scene, ``render`` images from any pinhole cameras.
+"""Trained scenes as functions: ``load`` a run, ``render`` images from any pinhole cameras.
 
-Neither needs the images of the capture, nor nerfstudio's classes at hand. README.md has an example.
+``mmpi_show.load`` reads baked scenes. None needs the images of the capture, nor nerfstudio's classes at hand.
+README.md has an example.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 import torch
+import yaml
 from jaxtyping import Float, Int
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from mmpi_ns.data.rays import image_rays
-from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.training.options import check_nothing_left
+from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.values import Number, check_number
-from mmpi_show.bake import read_run_config
-from mmpi_show.files import HEADER, read_baked
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,13 @@ class CameraPath:
     """Pixels; pixel centres lie at halves."""
     sizes: Int[Tensor, "N 2"]
     """Width and height, pixels."""
+
+    @staticmethod
+    def of(rows: Float[Tensor, "N 18"]) -> CameraPath:
+        """From rows of a pose [3, 4], focal lengths, principal point, width and height."""
+        intrinsics = torch.eye(3).repeat(len(rows), 1, 1)
+        intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]] = rows[:, 12:16]
+        return CameraPath(rows[:, :12].view(-1, 3, 4), intrinsics, rows[:, 16:].long())
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -70,47 +77,51 @@ class Images:
 
 
 def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
-    """A trained scene, from a run of ns-train or from an export.
-
-    A run is rendered exactly, as ns-eval renders it, from its last checkpoint. It needs no images of the capture. A
-    baked scene takes about half of the time on a CPU and differs by 0.01 dB (docs/export.md).
+    """A run of ns-train, rendered exactly, as ns-eval renders it, from its last checkpoint, without the images of the
+    capture.
 
     Args:
-        path: a run's folder or its config.yml, or a folder written by ``mmpi-export bake`` or ``mmpi-export web``.
+        path: a run's folder or its config.yml.
         device: where images are rendered; by default a GPU if there is one.
 
     Raises:
-        InputError: there is no scene, or its files are damaged (says which, and what to do).
+        InputError: there is no run, or its files are damaged (says which, and what to do).
     """
     path = Path(path)
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     folder = path.parent if path.is_file() else path
-    if (folder / HEADER).is_file():
-        baked = read_baked(folder)
-        rows = [[*chain(*pose.to_world), *pose.focal, *pose.center, *pose.size] for pose in baked.path]
-        cameras, windows = torch.tensor(rows), WindowedPlan(tuple(place for place, _ in baked.windows))
-        names, image_of = windows.names, lambda camera: baked.image(image_rays(camera.to("cpu")))
-    elif (folder / "config.yml").is_file():  # the model of a run with its last checkpoint, without a data manager
-        config = read_run_config(folder / "config.yml")
-        state = read_checkpoint(last_checkpoint(folder / "nerfstudio_models"))
-        cameras = state["capture"]["cameras"]
-        config.windows_folder = folder / "windows"
-        unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
-        model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
-        tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
-        model.load_state_dict(tensors)
-        model.update_to_step(state["step"])
-        model.eval()
-        names, image_of = model.progress.windows.names, model.get_outputs_for_camera
-    else:
+    if not (folder / "config.yml").is_file():
         raise InputError(
-            f"There is no scene at {path}: give the folder of a run (with config.yml), or one that mmpi-export bake or "
-            f"mmpi-export web wrote (with {HEADER})."
+            f"There is no run at {path}: give its folder, with config.yml. Scenes that mmpi-export bake or mmpi-export "
+            "web wrote are read by mmpi_show.load."
         )
-    intrinsics = torch.eye(3).repeat(len(cameras), 1, 1)
-    intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]] = cameras[:, 12:16]
-    views = CameraPath(cameras[:, :12].view(-1, 3, 4), intrinsics, cameras[:, 16:].long())
-    return Scene(names, views, device, image_of)
+    # The model with its last checkpoint, without a data manager.
+    config = read_run_config(folder / "config.yml")
+    state = read_checkpoint(last_checkpoint(folder / "nerfstudio_models"))
+    cameras = state["capture"]["cameras"]
+    config.windows_folder = folder / "windows"
+    unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
+    tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
+    model.load_state_dict(tensors)
+    model.update_to_step(state["step"])
+    model.eval()
+    return Scene(model.progress.windows.names, CameraPath.of(cameras), device, model.get_outputs_for_camera)
+
+
+def read_run_config(path: Path) -> MMPIModelConfig:
+    """The model's settings in a run's config.yml. Raises InputError if ns-train did not write it, trained another
+    method, or an earlier version did with an option that left."""
+    try:
+        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not a config.yml that ns-train wrote ({brief(error)}).") from error
+    if not isinstance(config, TrainerConfig):
+        raise InputError(f"{path} is not a config.yml that ns-train wrote: give the one beside nerfstudio_models.")
+    if not isinstance(config.pipeline.model, MMPIModelConfig):
+        raise InputError(f"The run of {path} was trained by another method: only those of mmpi can be read.")
+    check_nothing_left(config.pipeline.model)
+    return config.pipeline.model
 
 
 @torch_apart()

@@ -17,6 +17,7 @@ from filelock import FileLock, Timeout
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
+from mmpi_ns.utils.arrays import Arrays, Pairs, write_arrays
 from mmpi_ns.utils.files import cache_folder, write_atomically
 
 KEPT = 24
@@ -29,8 +30,6 @@ HELD, HELD_BYTES = 32, 2**28
 """Images that are kept while their neighbours are compared with them, and the bytes that they may take."""
 
 T = TypeVar("T")
-Arrays = Mapping[str, NDArray[np.generic]]
-Pairs = Iterable[tuple[str, NDArray[np.generic]]]
 
 
 def digest(files: Iterable[Path], *parts: object) -> str:
@@ -121,14 +120,6 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
                 old.unlink(missing_ok=True)
                 old.with_suffix(".lock").unlink(missing_ok=True)
     return arrays
-
-
-def write_arrays(path: Path, arrays: Arrays | Pairs) -> None:
-    """Writes an .npz, whatever the file's ending."""
-    with zipfile.ZipFile(path, "w") as file:  # as np.savez, which asks for all arrays at once
-        for name, array in arrays.items() if isinstance(arrays, Mapping) else arrays:
-            with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, np.asanyarray(array), version=(1, 0), allow_pickle=False)
 
 
 def _read(path: Path) -> Arrays | None:

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 import torch
 
-from mmpi_ns.ops.likeness import Likeness, most_alike
 from mmpi_priors.dense import mean_and_contrast
 from mmpi_priors.moving_evidence import Mask, Neighbour, Shot
 from mmpi_priors.moving_sweep import ALIKE, CONTRAST, INSIDE, compared, solid
+from mmpi_priors.ops.likeness import Likeness, most_alike
 from mmpi_priors.views import Map
 
 AFTER, STATIC = 2, 4

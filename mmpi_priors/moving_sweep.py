@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import torch
 
-from mmpi_ns.ops.likeness import most_alike
-from mmpi_ns.ops.patches import Others, others_of
 from mmpi_priors.dense import mean_and_contrast
 from mmpi_priors.moving_evidence import Mask, Neighbour, Shot
+from mmpi_priors.ops.likeness import most_alike
+from mmpi_priors.ops.patches import Others, others_of
 from mmpi_priors.views import Map, Parallax, View
 
 NEIGHBOURS = 4

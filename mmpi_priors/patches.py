@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.ops.patches import GRAZING, OFFSETS, Patches, compare_planes, others_of, spread_planes
+from mmpi_priors.ops.patches import GRAZING, OFFSETS, Patches, compare_planes, others_of, spread_planes
 from mmpi_priors.views import Map, Parallax, View
 
 PIXELS = 220.0**2

@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.ops.matches import place_pixels
 from mmpi_ns.utils.errors import InputError
+from mmpi_priors.ops.matches import place_pixels
 from mmpi_priors.tracks import PosedImages
 
 Map = NDArray[np.float32]

@@ -1,1 +1,17 @@
-"""Baked scenes: the web page that plays them, splats, and their renderer."""
+"""What is shown of trained scenes apart from nerfstudio: baked scenes, their web page, splats.
+
+``scene = mmpi_show.load(folder)`` reads a baked scene, and ``mmpi_ns.render`` renders images of it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def __getattr__(name: str) -> Any:
+    """The function above, imported when it is first asked for: torch and nerfstudio take seconds."""
+    if name != "load":
+        raise AttributeError(f"module 'mmpi_show' has no attribute '{name}'")
+    from mmpi_show.functional import load
+
+    return load

@@ -10,21 +10,18 @@ from statistics import fmean
 from typing import Any
 
 import torch
-import yaml
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.model import MMPIModel, MMPIModelConfig
+from mmpi_ns.functional import read_run_config
+from mmpi_ns.model import MMPIModel
 from mmpi_ns.rendering.metrics import ImageMetrics, psnr
 from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.windows import window_shares
-from mmpi_ns.training.options import check_nothing_left
-from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import in_order, torch_apart
 from mmpi_show.codes import smoothed_codes
 from mmpi_show.details import stored_view
@@ -37,21 +34,6 @@ SLACK = 0.01
 training view sees it: of a colour, at most 0.0025 of a pixel."""
 MOST_LOOKED_AT = 60e6
 """Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
-
-
-def read_run_config(path: Path) -> MMPIModelConfig:
-    """The model's settings in a run's config.yml. Raises InputError if ns-train did not write it, trained another
-    method, or an earlier version did with an option that left."""
-    try:
-        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not a config.yml that ns-train wrote ({brief(error)}).") from error
-    if not isinstance(config, TrainerConfig):
-        raise InputError(f"{path} is not a config.yml that ns-train wrote: give the one beside nerfstudio_models.")
-    if not isinstance(config.pipeline.model, MMPIModelConfig):
-        raise InputError(f"The run of {path} was trained by another method: only those of mmpi can be read.")
-    check_nothing_left(config.pipeline.model)
-    return config.pipeline.model
 
 
 def load_model(load_config: Path, details: bool = False) -> Any:

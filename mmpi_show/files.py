@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.ops.baked import reader
 from mmpi_ns.rendering.details import Details, DetailView
 from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks, render_windows
+from mmpi_ns.scene.columns import bits_of
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.errors import InputError
@@ -31,7 +31,8 @@ from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order, torch_apart
 from mmpi_show.codes import coarse_differences, split_codes
 from mmpi_show.details import STEP, StoredView, restored_view
-from mmpi_show.scene import SIDE, BakedMpis, Codes, Shader, bits_of, neighbours
+from mmpi_show.ops.baked import reader
+from mmpi_show.scene import SIDE, BakedMpis, Codes, Shader, neighbours
 from mmpi_show.windows import BakedWindow
 
 FORMAT, VERSION = "mmpi-baked", 4

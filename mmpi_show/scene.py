@@ -17,14 +17,13 @@ import torch
 from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor
 
+from mmpi_ns.scene.columns import WORD, bits_of
 from mmpi_ns.scene.plan import MPIPlan
 
 SIDE = 8
 """Texels along each side of a baked brick."""
 CELLS = SIDE - 1
 """Cells (squares between four texels) along each side of a baked brick."""
-WORD = 32
-"""Planes of a column."""
 FINENESS = 8
 """Subdivisions between two codes in the table of optical depths of interpolated codes."""
 MOST_CHANNELS = 16
@@ -108,11 +107,6 @@ def tiles_of(mpi: MPIPlan) -> tuple[int, int, int]:
     return -(-mpi.planes // WORD), -(-(mpi.height - 1) // CELLS), -(-(mpi.width - 1) // CELLS)
 
 
-def bits_of(masks: Int[Tensor, "N"]) -> Int[Tensor, "N 32"]:
-    """The bits of columns, lowest first."""
-    return (masks[:, None] >> torch.arange(WORD)) & 1
-
-
 def brick_numbers(columns: Int[Tensor, "N 2"], mpis: Sequence[MPIPlan]) -> Iterator[Int[Tensor, "P Y X"]]:
     """Brick of every tile of each MPI from the columns of all; -1 if it is empty."""
     bits = bits_of(columns[:, 0])
@@ -146,21 +140,3 @@ def most_of_copies(values: Float[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]) -
     texels = torch.arange(values.numel()).view(values.shape)
     take_borders(texels, beside)
     return torch.zeros(values.numel()).scatter_reduce_(0, texels.flatten(), values.flatten(), "amax")[texels]
-
-
-def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Tensor, "B 3"]]:
-    """Columns of one MPI, and (plane, row, column) of its bricks in their order.
-
-    Args:
-        stored: bool [planes, down, across], which tiles are occupied.
-        first: bricks of the MPIs before.
-    """
-    planes, down, across = stored.shape
-    padded = torch.nn.functional.pad(stored, (0, 0, 0, 0, 0, -planes % WORD))
-    bits = padded.view(-1, WORD, down, across).permute(0, 2, 3, 1).reshape(-1, WORD)
-    masks = (bits.to(torch.int64) << torch.arange(WORD)).sum(-1)
-    counts = bits.sum(-1)
-    columns = torch.stack([torch.where(masks >= 2**31, masks - 2**32, masks), first + counts.cumsum(0) - counts], -1)
-    column, bit = bits.nonzero().unbind(-1)
-    word, place = column // (down * across), column % (down * across)
-    return columns.to(torch.int32), torch.stack([word * WORD + bit, place // across, place % across], -1)

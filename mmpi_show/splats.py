@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from mmpi_ns.ops.gather import COLORS, activate
-from mmpi_ns.ops.splat import BLUR, Gaussians, View, splat_errors, splat_image
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order, torch_apart
 from mmpi_show.files import Pose
+from mmpi_show.ops.splat import BLUR, Gaussians, View, splat_errors, splat_image
 from mmpi_show.scene import CELLS, SIDE, brick_numbers
 from mmpi_show.windows import BakedWindow
 

@@ -15,15 +15,16 @@ from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
-from mmpi_ns.ops.baked import shade_baked, show_baked
 from mmpi_ns.ops.blending import blended_optical_depth, log_shares
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.march import Rays
 from mmpi_ns.scene import geometry
+from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
-from mmpi_show.scene import CELLS, MOST_CHANNELS, SIDE, BakedMpis, Codes, Shader, brick_numbers, columns_from
+from mmpi_show.ops.baked import shade_baked, show_baked
+from mmpi_show.scene import CELLS, MOST_CHANNELS, SIDE, BakedMpis, Codes, Shader, brick_numbers
 
 THINNEST = -12.0
 """Lower bound on the raw density of code 0; its softplus is 6e-6."""

@@ -34,9 +34,9 @@ def main(folder: tyro.conf.Positional[Path], scale: int = 1, frames: int = 8, ro
     say("torch")
     import numpy as np
 
-    from mmpi_ns.ops.baked.reader import camera_rays
     from mmpi_ns.rendering.images import CPU_RAYS
     from mmpi_show.files import read_baked
+    from mmpi_show.ops.baked.reader import camera_rays
 
     torch.set_num_threads(1)
     say("and what reads and renders")

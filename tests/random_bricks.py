@@ -11,10 +11,11 @@ import torch
 from hand_made import random_mpi
 from random_fields import random_rays
 
+from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window
 from mmpi_show.files import BakedScene, Pose
-from mmpi_show.scene import BakedMpis, Codes, Shader, columns_from, neighbours, take_borders, tiles_of
+from mmpi_show.scene import BakedMpis, Codes, Shader, neighbours, take_borders, tiles_of
 from mmpi_show.windows import BakedWindow
 
 

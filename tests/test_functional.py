@@ -1,4 +1,4 @@
-"""``mmpi_ns.load`` and ``mmpi_ns.render``: the images of ns-eval and of baked scenes, in batches, and refusals."""
+"""``load`` and ``render`` of runs and of baked scenes: the images of ns-eval and of bricks, batches, refusals."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from tiny_scene import write_scene
 from training_runs import ready, trainer_config, write_plan, write_windows
 
 import mmpi_ns
+import mmpi_show
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.ops.baked.reader import camera_rays
 from mmpi_ns.utils.errors import InputError
 from mmpi_show.files import HEADER, BakedScene, read_baked, write_baked
+from mmpi_show.ops.baked.reader import camera_rays
 
 ROOT = Path(__file__).parents[1]
 
@@ -99,7 +100,7 @@ def baked(tmp_path_factory):
 
 def test_images_of_a_baked_scene_are_those_of_its_bricks(baked):
     """Over the whole path, with all windows; rays are made apart, in float64."""
-    scene, bricks = mmpi_ns.load(baked, device="cpu"), read_baked(baked)
+    scene, bricks = mmpi_show.load(baked, device="cpu"), read_baked(baked)
     assert len(scene.mpis) == 5 and len(scene.path) == len(bricks.path)
     for i, pose in enumerate(bricks.path):
         width, height = pose.size
@@ -114,12 +115,12 @@ def test_images_of_a_baked_scene_are_those_of_its_bricks(baked):
 
 def test_baked_images_leave_the_cores_to_the_kernels(baked, monkeypatch, three_threads):
     """Torch's second thread would spin beside them: of rays made for ``render``, and where an image is asked for."""
-    scene, bricks, threads = mmpi_ns.load(baked, device="cpu"), read_baked(baked), []
+    scene, bricks, threads = mmpi_show.load(baked, device="cpu"), read_baked(baked), []
 
     def watched(function):
         return lambda *values: threads.append(torch.get_num_threads()) or function(*values)
 
-    monkeypatch.setattr("mmpi_ns.functional.image_rays", watched(image_rays))
+    monkeypatch.setattr("mmpi_show.functional.image_rays", watched(image_rays))
     monkeypatch.setattr(BakedScene, "render", watched(BakedScene.render))
     mmpi_ns.render(scene, scene.path.camera_to_worlds[0], scene.path.intrinsics[0], 20, 12)
     assert len(threads) > 1 and set(threads) == {1}
@@ -130,7 +131,7 @@ def test_baked_images_leave_the_cores_to_the_kernels(baked, monkeypatch, three_t
 
 def test_cameras_come_in_batches_of_any_shape(baked):
     """Poses [N, M, 3 or 4, 4] with intrinsics for each or for all; numbers may be plain lists."""
-    scene = mmpi_ns.load(baked, device="cpu")
+    scene = mmpi_show.load(baked, device="cpu")
     poses, lens = scene.path.camera_to_worlds[:2], scene.path.intrinsics[0]
     last = torch.tensor([0.0, 0, 0, 1]).expand(2, 1, 4)
     grid = torch.stack([torch.cat([poses, last], 1)] * 3)
@@ -162,8 +163,9 @@ def test_examples_of_the_documentation_run(page, number, run, baked, tmp_path, m
 
 
 def test_what_is_no_scene_is_one_sentence(tmp_path, run):
-    with pytest.raises(InputError, match=r"There is no scene at .*nothing"):
-        mmpi_ns.load(tmp_path / "nothing")
+    for package, kind in ((mmpi_ns, "run"), (mmpi_show, "baked scene")):
+        with pytest.raises(InputError, match=f"There is no {kind} at .*nothing"):
+            package.load(tmp_path / "nothing")
     config = tmp_path / "config.yml"
     for text, words in (("a: [", "not a config.yml that ns-train wrote \\("), ("a: 1", "beside nerfstudio_models")):
         config.write_text(text)
@@ -178,11 +180,11 @@ def test_what_is_no_scene_is_one_sentence(tmp_path, run):
         mmpi_ns.load(tmp_path)
     (tmp_path / HEADER).write_text("{")
     with pytest.raises(ValueError, match="damaged"):
-        mmpi_ns.load(tmp_path)
+        mmpi_show.load(tmp_path)
 
 
 def test_cameras_that_cannot_be_rendered_are_one_sentence(baked):
-    scene = mmpi_ns.load(baked, device="cpu")
+    scene = mmpi_show.load(baked, device="cpu")
     pose, lens = scene.path.camera_to_worlds[0], scene.path.intrinsics[0]
     skewed, flat = lens.clone(), lens.clone()
     skewed[0, 1], flat[1, 1] = 0.1, 0.0

@@ -17,7 +17,7 @@ METHOD = ["utils", "scene", "ops", "placement", "data", "field", "rendering", "t
 COMPANIONS = {
     "mmpi_priors": {"utils", "scene", "ops", "placement", "data"},
     "mmpi_prepare": {"utils", "scene", "placement", "data", "scripts", "mmpi_priors"},
-    "mmpi_show": {*METHOD, "scripts"},
+    "mmpi_show": {*METHOD, "functional", "scripts"},
     "mmpi_scene": {"utils", "scripts"},
 }
 """Packages beside the method, which never imports them."""
@@ -30,14 +30,8 @@ COMMANDS = {
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
 MAY_IMPORT |= {wing: others | {wing} for wing, others in (COMMANDS | COMPANIONS).items()}
 UPWARD = {
-    *("mmpi_ns.data.datamanager", "mmpi_ns.data.dataset", "mmpi_ns.data.ray_sources", "mmpi_ns.functional"),
-    *(
-        "mmpi_ns.model",
-        "mmpi_ns.ops.baked",
-        "mmpi_ns.ops.march",
-        "mmpi_ns.rendering.details",
-        "mmpi_ns.rendering.exposure",
-    ),
+    *("mmpi_ns.data.datamanager", "mmpi_ns.data.dataset", "mmpi_ns.data.ray_sources"),
+    *("mmpi_ns.model", "mmpi_ns.rendering.exposure"),
     *("mmpi_ns.scripts.plan", "mmpi_ns.training.trainer"),
 }
 """Modules of the method that still import a companion."""

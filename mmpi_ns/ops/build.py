@@ -1,4 +1,4 @@
-"""Compiles the C++ of all operations into one library: by the machine's own compiler, at first use (4 seconds)."""
+"""Compiles C++: the operations of each package into one library, by the machine's own compiler, at first use."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from mmpi_ns.utils.files import cache_folder
 from mmpi_ns.utils.parallel import num_threads
 
 OPS = Path(__file__).parent
+"""Folder of the method's operations; packages beside it have folders like it."""
 HEADERS = OPS / "cpp"
 FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{HEADERS}"]
 """No option that reorders sums, so that results do not depend on the compiler."""
@@ -52,12 +53,12 @@ def compiler() -> list[str]:
     return program
 
 
-def library_file() -> Path:
-    """Path of the compiled library, with a name for each combination of sources, compiler and processor. Raises
-    CannotCompile if there is no compiler, or there are no sources."""
-    sources = sorted(OPS.glob("*/*.cpp"))
+def library_file(folder: Path = OPS) -> Path:
+    """Path of the compiled library of the operations in a folder, with a name for each combination of sources, compiler
+    and processor. Raises CannotCompile if there is no compiler, or there are no sources."""
+    sources = sorted(folder.glob("*/*.cpp"))
     if not sources:
-        raise CannotCompile(f"{OPS} holds no C++ sources: install the package again")
+        raise CannotCompile(f"{folder} holds no C++ sources: install the package again")
     texts = [p.read_bytes() for p in [*sources, *sorted(HEADERS.glob("*.h"))]]
     try:  # what -march=native depends on: different machines may share a home folder
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -70,32 +71,31 @@ def library_file() -> Path:
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
-    """All compiled functions, from the cache if they have been compiled before. Raises CannotCompile if there is no
-    compiler, or it fails."""
-    target, program = library_file(), compiler()
+def library(folder: Path = OPS) -> ctypes.CDLL:
+    """The compiled functions of a folder, from the cache if they have been compiled before. Raises CannotCompile if
+    there is no compiler, or it fails."""
+    target, command = library_file(folder), [*compiler(), *FLAGS, *map(str, sorted(folder.glob("*/*.cpp")))]
     try:
         if target.is_file():
             with suppress(OSError):  # cut short, or of a newer glibc: containers may share a home folder
                 return ctypes.CDLL(str(target))
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            return _compiled(program, target, target.parent)
+            return _compiled(command, target, target.parent)
         except (OSError, subprocess.CalledProcessError):  # full or not to be written: each process compiles its own
-            return _compiled(program, target, None)
+            return _compiled(command, target, None)
     except subprocess.CalledProcessError as error:
         words = (error.stderr or "").strip() or f"exit status {error.returncode}"
-        raise CannotCompile(f"{program[0]} failed: {words.splitlines()[0]}") from error
+        raise CannotCompile(f"{command[0]} failed: {words.splitlines()[0]}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CannotCompile(str(error)) from error
 
 
-def _compiled(program: list[str], target: Path, folder: Path | None) -> ctypes.CDLL:
+def _compiled(command: list[str], target: Path, folder: Path | None) -> ctypes.CDLL:
     """Compiles the library in a folder of the target's disk and keeps it; where there is none, in a temporary one."""
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         unfinished = Path(scratch) / target.name
-        command = [*program, *FLAGS, "-o", str(unfinished), *map(str, sorted(OPS.glob("*/*.cpp")))]
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
+        subprocess.run([*command, "-o", str(unfinished)], check=True, capture_output=True, text=True, timeout=600)
         built = ctypes.CDLL(str(unfinished))
         if folder is not None:
             os.replace(unfinished, target)
@@ -130,7 +130,7 @@ def _struct(*types: type) -> type[ctypes.Structure]:
     return type("Struct", (ctypes.Structure,), {"_fields_": [(f"_{i}", t) for i, t in enumerate(types)]})
 
 
-def call_in_parts(name: str, parts: int | Sequence[int], *values: Any, least: int = 256) -> None:
+def call_in_parts(name: str, parts: int | Sequence[int], *values: Any, least: int = 256, folder: Path = OPS) -> None:
     """Calls a compiled function of ``(begin, end, *values)`` for parts of some numbers, each by a thread
     (``cpp/parts.h``). Parts must not write to one place.
 
@@ -139,10 +139,11 @@ def call_in_parts(name: str, parts: int | Sequence[int], *values: Any, least: in
         parts: bounds of the parts; of one number, even parts of 0 to that (``even_bounds``).
         values: further arguments (``arguments``).
         least: numbers of an even part, at least.
+        folder: of the operations.
     """
     bounds = even_bounds(parts, least) if isinstance(parts, int) else parts
     how = (ctypes.c_int64 * len(bounds))(*bounds), ctypes.c_int64(len(bounds) - 1)
-    _function(f"{name}_in_parts")(*how, *arguments(values))
+    _function(f"{name}_in_parts", folder)(*how, *arguments(values))
 
 
 class Pending:
@@ -172,8 +173,8 @@ def leave_in_parts(name: str, count: int, size: int, *values: Any) -> Pending | 
 
 
 @functools.cache
-def _function(name: str) -> Callable[..., int]:
-    address = ctypes.c_void_p.in_dll(library(), name).value
+def _function(name: str, folder: Path = OPS) -> Callable[..., int]:
+    address = ctypes.c_void_p.in_dll(library(folder), name).value
     assert address is not None
     return ctypes.CFUNCTYPE(ctypes.c_int64)(address)
 

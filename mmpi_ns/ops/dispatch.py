@@ -62,7 +62,9 @@ class Operation(Generic[P, R]):
         functools.update_wrapper(self, reference)
         self.reference, self.compiled, self.check = reference, list(compiled), check
         self.name, self.signature = reference.__name__, inspect.signature(reference)
-        _OPERATIONS[self.name] = self
+        self.folder = Path(inspect.getfile(reference)).parents[1]
+        """Of the package's operations: one library."""
+        OPERATIONS[self.name] = self
         if in_cpp is not None:
             self.hints, self.least = get_type_hints(reference), in_cpp
             self.on_cpu(functools.update_wrapper(functools.partial(self._in_cpp), reference))
@@ -112,11 +114,14 @@ class Operation(Generic[P, R]):
         columns = [forms["return"]] if "return" in forms else annotated(hints["return"]).values()
         results = [torch.empty([sizes.get(n, n) for n in shape], dtype=kind) for shape, kind in columns]
         parts = len(results[0]) if least else [0, len(results[0])]
-        build.call_in_parts(f"mmpi_{self.name}", parts, *passed, *sizes.values(), *results, least=least)
+        build.call_in_parts(
+            f"mmpi_{self.name}", parts, *passed, *sizes.values(), *results, least=least, folder=self.folder
+        )
         return results[0] if "return" in forms else hints["return"](*results)
 
 
-_OPERATIONS: dict[str, Operation[..., Any]] = {}
+OPERATIONS: dict[str, Operation[..., Any]] = {}
+"""Every operation that has been imported, by its name."""
 
 
 def operation(
@@ -131,14 +136,6 @@ def operation(
             worth another thread, 0: one thread computes all.
     """
     return functools.partial(Operation, compiled=compiled, check=check, in_cpp=in_cpp)
-
-
-@functools.cache
-def operations() -> dict[str, Operation[..., Any]]:
-    """Every operation by its name."""
-    for path in build.OPS.glob("*/__init__.py"):
-        importlib.import_module(f"mmpi_ns.ops.{path.parent.name}")
-    return _OPERATIONS
 
 
 def on_gpu(x: Tensor) -> bool:
@@ -156,13 +153,13 @@ def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
 
 def form_of(name: str, *tensors: Tensor) -> Form:
     """The form for these tensors: a compiled one takes float32, integers and Adam's bfloat16 on one device."""
-    compiled = operations()[name].compiled
+    operation = OPERATIONS[name]
     devices = {t.device.type for t in tensors}
     if _chosen == "torch" or any(t.is_floating_point() and t.dtype not in _PRECISIONS for t in tensors):
         return "reference"
     if devices == {"cpu"} and not interpreting:
-        return "cpu" if "cpu" in compiled and fault("C++") is None else "reference"
-    if devices == ({"cpu"} if interpreting else {"cuda"}) and "gpu" in compiled and fault("Triton") is None:
+        return "cpu" if "cpu" in operation.compiled and fault("C++", operation.folder) is None else "reference"
+    if devices == ({"cpu"} if interpreting else {"cuda"}) and "gpu" in operation.compiled and fault("Triton") is None:
         return "gpu"
     return "reference"
 
@@ -170,7 +167,7 @@ def form_of(name: str, *tensors: Tensor) -> Form:
 @functools.cache
 def function(name: str, form: Form) -> Any:
     """One form of an operation."""
-    of = operations()[name]
+    of = OPERATIONS[name]
     return getattr(of, form) if form != "gpu" else getattr(importlib.import_module(f"{of.__module__}.gpu"), name)
 
 
@@ -200,13 +197,15 @@ def chosen(path: Route) -> Iterator[None]:
 
 
 @functools.cache
-def fault(what: Literal["C++", "Triton"]) -> str | None:
-    """Why the compiler or Triton cannot be used; None where it can. Found out and said once."""
+def fault(what: Literal["C++", "Triton"], folder: Path = build.OPS) -> str | None:
+    """Why the compiler, for the operations in a folder, or Triton cannot be used; None where it can. Found out and said
+    once."""
     if what == "C++":
         try:
-            if not build.library_file().is_file():
-                CONSOLE.print("Compiling the inner loops for this processor: half a minute, once.")
-            build.library()
+            if not build.library_file(folder).is_file():
+                name = folder.parent.name
+                CONSOLE.print(f"Compiling the inner loops of {name} for this processor: half a minute, once.")
+            build.library(folder)
         except build.CannotCompile as error:
             return _say(str(error))
         return None

@@ -30,9 +30,9 @@ from torch import Tensor
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH, seen_details
 from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.arrays import write_arrays
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import write_atomically
-from mmpi_priors.cache import write_arrays
 
 MAX_ANGLE = 45.0
 """Between the viewing directions of an image and of the training images that it takes details from, degrees."""

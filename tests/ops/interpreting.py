@@ -7,6 +7,7 @@ import torch
 from gpu_parts import interpret
 
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.march import march
 
 
 @pytest.fixture(autouse=True)
@@ -14,7 +15,7 @@ def interpreted(monkeypatch):
     """Every test runs on the kernels; one that silently took plain torch would test nothing."""
     monkeypatch.setattr(dispatch, "_chosen", "auto")
     interpret(True)
-    assert dispatch.form_of("march", torch.zeros(1)) == "gpu"
+    assert dispatch.form_of(march.name, torch.zeros(1)) == "gpu"
     yield
     interpret(False)
 

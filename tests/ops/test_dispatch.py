@@ -6,6 +6,7 @@ import importlib
 import inspect
 import math
 import subprocess
+from pathlib import Path
 
 import pytest
 import torch
@@ -16,8 +17,17 @@ from random_fields import bundle, random_field, random_rays, render
 from mmpi_ns.ops import build, dispatch
 
 
-def test_every_form_of_an_operation_has_its_signature():
-    for name, operation in dispatch.operations().items():
+@pytest.fixture(scope="module")
+def operations():
+    """All of them, by name."""
+    for ops in ("mmpi_ns.ops", "mmpi_priors.ops", "mmpi_show.ops"):
+        for path in Path(str(importlib.import_module(ops).__file__)).parent.glob("*/__init__.py"):
+            importlib.import_module(f"{ops}.{path.parent.name}")
+    return dispatch.OPERATIONS
+
+
+def test_every_form_of_an_operation_has_its_signature(operations):
+    for name, operation in operations.items():
         for form in operation.compiled:
             if form == "gpu" and importlib.util.find_spec("triton") is None:
                 continue
@@ -25,8 +35,8 @@ def test_every_form_of_an_operation_has_its_signature():
             assert parameters == list(operation.signature.parameters), (name, form)
 
 
-def test_every_operation_with_a_gpu_form_has_cases():
-    assert set(CASES) == {name for name, each in dispatch.operations().items() if "gpu" in each.compiled}
+def test_every_operation_with_a_gpu_form_has_cases(operations):
+    assert set(CASES) == {name for name, each in operations.items() if "gpu" in each.compiled}
 
 
 @pytest.fixture

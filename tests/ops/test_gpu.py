@@ -177,4 +177,4 @@ def test_a_triton_too_old_for_the_kernels_is_refused_in_one_sentence(monkeypatch
 
 
 def test_on_a_cpu_nothing_takes_the_gpus_kernels():
-    assert all(dispatch.form_of(name, torch.zeros(1)) != "gpu" for name in dispatch.operations())
+    assert all(dispatch.form_of(name, torch.zeros(1)) != "gpu" for name in dispatch.OPERATIONS)

@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from random_bricks import random_window, rays_into
 from torch import Tensor
 
-from mmpi_ns.ops.baked import show_baked
 from mmpi_ns.ops.layout import Tables, check_shapes
 from mmpi_ns.ops.march import MarchOptions, Rays, march, show_rays
+from mmpi_show.ops.baked import show_baked
 
 
 class Pair(NamedTuple):

@@ -7,6 +7,7 @@ must weigh to be kept), so a ray costs what lies in front of its first surfaces.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from mmpi_ns.ops.blending import blended_optical_depth, log_shares
-from mmpi_ns.ops.build import call_in_parts, structs
+from mmpi_ns.ops.build import OPS, call_in_parts, structs
 from mmpi_ns.ops.composite import composite_weights, exclusive_cumsum, median_inverse_distance, winning_heads
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
@@ -24,8 +25,8 @@ from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.ops.march.rays import Capacity as Capacity
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
+from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
-from mmpi_show.scene import columns_from
 
 BLEND_BLOCK = 16
 """Samples of a ray between two checks whether it is already opaque."""
@@ -263,10 +264,10 @@ def prune(
 # On a CPU ------------------------------------------------------------------------------------------------------------
 
 
-def shown(name: str, num_rays: int, channels: int, *values: Any) -> Shown:
-    """What a compiled function of ``(begin, end, *values, outputs)`` shows."""
+def shown(name: str, num_rays: int, channels: int, *values: Any, folder: Path = OPS) -> Shown:
+    """What a compiled function of ``(begin, end, *values, outputs)`` shows (see ``build.call_in_parts``)."""
     outputs = [torch.empty(num_rays, n) for n in (channels, 1, 1, 1, 1, 1, 1)]
-    call_in_parts(name, num_rays, *values, structs(outputs))
+    call_in_parts(name, num_rays, *values, structs(outputs), folder=folder)
     return Shown(*outputs)
 
 

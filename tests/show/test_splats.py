@@ -9,9 +9,9 @@ import pytest
 import torch
 from random_bricks import random_window, scene_of
 
-from mmpi_ns.ops.splat import View, splat_image
 from mmpi_show import splats
 from mmpi_show.files import Pose
+from mmpi_show.ops.splat import View, splat_image
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,11 @@ import torch
 from random_bricks import random_window, rays_into, scene_of
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.baked import reader
 from mmpi_ns.ops.march import Rays
+from mmpi_ns.scene.columns import columns_from
 from mmpi_show.files import write_baked
-from mmpi_show.scene import SIDE, Shader, brick_numbers, columns_from
+from mmpi_show.ops.baked import reader
+from mmpi_show.scene import SIDE, Shader, brick_numbers
 
 FORMS = ("reference", "cpu")
 

@@ -1,6 +1,6 @@
 """A reader of baked scenes in plain NumPy: the format and its rendering (docs/export.md) in under two hundred lines.
 
-    python mmpi_ns/ops/baked/reader.py FOLDER NUMBER image.npy      # renders camera NUMBER of the path
+    python mmpi_show/ops/baked/reader.py FOLDER NUMBER image.npy      # renders camera NUMBER of the path
 
 Float64, every plane of every MPI, and no code of the rest: an example for other viewers, what all tests of bricks
 compare with, and what renders them where there is no compiler.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mmpi_ns.ops.splat import Gaussians, View, splat_errors, splat_image
+from mmpi_show.ops.splat import Gaussians, View, splat_errors, splat_image
 
 VIEW = View(
     torch.eye(4)[:3] + torch.tensor([[0, 0, 0, 0.3], [0, 0, 0, -0.2], [0, 0, 0, 1.0]]),

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.likeness import most_alike
-from mmpi_ns.ops.patches import others_of
+from mmpi_priors.ops.likeness import most_alike
+from mmpi_priors.ops.patches import others_of
 
 SHAPE, SHAPES = (13, 21), [(13, 21), (9, 30), (16, 8), (13, 21)]
 CLOSE = 0.01

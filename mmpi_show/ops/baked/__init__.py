@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.baked import reader
 from mmpi_ns.ops.build import call_in_parts, structs
 from mmpi_ns.ops.composite import median_inverse_distance, winning_heads
 from mmpi_ns.ops.dispatch import operation
@@ -23,6 +22,8 @@ from mmpi_ns.ops.layout import dense, dense_fields, frame_rows, shaped
 from mmpi_ns.ops.march import shown
 from mmpi_ns.ops.march.rays import Rays, Shown
 from mmpi_ns.scene.geometry import Frames
+from mmpi_show.ops import OPS
+from mmpi_show.ops.baked import reader
 from mmpi_show.scene import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, tiles_of
 
 
@@ -123,7 +124,7 @@ def show_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Ten
     if peaks is not None:
         assert dense(peaks)[0] is peaks, "peaks are written in place"
     walk = (scene.packed["cpu"], structs(dense_fields(rays)), float(threshold), peaks)
-    return shown("mmpi_show_baked", len(rays.origins), len(scene.channel_codes), *walk)
+    return shown("mmpi_show_baked", len(rays.origins), len(scene.channel_codes), *walk, folder=OPS)
 
 
 @shade_baked.on_cpu
@@ -136,5 +137,6 @@ def shade_baked_on_cpu(shader: Shader, gathered: Tensor, mass: Tensor, direction
     assert inputs == COLORS, f"a network of {inputs} outputs where a colour is read"
     rgb, sizes = torch.empty(num_rays, 3), (len(numbers), channels, shader.direction_octaves, float(shader.bound))
     layers = structs(*((*weights.shape, weights, biases) for weights, biases in numbers))
-    call_in_parts("mmpi_shade_baked", num_rays, layers, *sizes, *dense(gathered, mass, directions), rgb)
+    values = (layers, *sizes, *dense(gathered, mass, directions), rgb)
+    call_in_parts("mmpi_shade_baked", num_rays, *values, folder=OPS)
     return rgb

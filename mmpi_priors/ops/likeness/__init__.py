@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mmpi_ns.ops.dispatch import operation
-from mmpi_ns.ops.patches import Others
+from mmpi_priors.ops.patches import Others
 
 REACH, PIXELS, STEPS = 3, 49, 32
 """Pixels of a window on each side of its middle, all of them, and places in a pixel that are told apart. A window whose

@@ -12,9 +12,9 @@ import torch
 from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
-from mmpi_ns.ops.matches import average_matches
 from mmpi_priors import dense
 from mmpi_priors.dense import Depth, confirmed, find_depths, without_fringes
+from mmpi_priors.ops.matches import average_matches
 from mmpi_priors.views import View, camera_matrix, load_view, look_up, project
 
 F32 = np.float32

@@ -9,7 +9,7 @@ import torch
 from scipy.ndimage import correlate, map_coordinates
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.motion import find_motion, refine_motion
+from mmpi_priors.ops.motion import find_motion, refine_motion
 
 SIDE, FLAT = 8, 16
 

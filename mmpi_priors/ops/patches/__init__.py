@@ -15,7 +15,7 @@ from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 
 from mmpi_ns.ops.dispatch import operation
-from mmpi_ns.ops.matches import linear_at
+from mmpi_priors.ops.matches import linear_at
 
 REACH = 2
 """Pixels of a patch on each side of its middle."""

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
+from mmpi_priors.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
 
 ROWS, COLUMNS = 14, 37
 NOISE, FARTHEST, MOST_RELATIVE = 0.3, 1.0, 0.15

@@ -11,11 +11,11 @@ import pytest
 import torch
 from random_bricks import random_window, rays_into, scene_of
 
-from mmpi_ns.ops.baked import reader, show_baked
 from mmpi_ns.ops.march import Rays
 from mmpi_show import files
 from mmpi_show.details import StoredView
 from mmpi_show.files import HEADER, read_baked, write_baked
+from mmpi_show.ops.baked import reader, show_baked
 
 
 @pytest.fixture

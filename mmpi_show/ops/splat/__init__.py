@@ -1,6 +1,6 @@
 """Gaussians seen by a camera as viewers of 3D Gaussian splatting show them: the image, and what each gave to it.
 
-Compiled alone (``splat.cpp``): only ``mmpi-export splats`` needs it. Source: Kerbl et al. (2023), sec. 4.
+Only ``mmpi-export splats`` needs it, and it has no form in plain torch. Source: Kerbl et al. (2023), sec. 4.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.build import arguments, library, structs
 from mmpi_ns.ops.layout import check_shapes, dense
+from mmpi_show.ops import OPS
 
 BLUR = 0.3
 """Variance that is added to a projected Gaussian, square pixels (as in ``splat.cpp``)."""
@@ -86,4 +87,4 @@ def _run(function: Callable[..., Tensor], gaussians: Gaussians, view: View, out:
     inputs = dense(*gaussians, *tensors.values())
     camera, seen = structs((*numbers, *map(ctypes.c_int32, view.size))), structs((count, *inputs[:3]))
     values = (camera, seen, *inputs[3:], out)  # alive until it has run
-    getattr(library(), f"mmpi_{function.__name__}")(*arguments(values))
+    getattr(library(OPS), f"mmpi_{function.__name__}")(*arguments(values))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.patches import Others, Patches, compare_planes, others_of, spread_planes
+from mmpi_priors.ops.patches import Others, Patches, compare_planes, others_of, spread_planes
 
 HEIGHT, WIDTH, STRIDE, ALONE = 18, 37, 2, 0.1
 PINHOLE = np.array([40.0, 44.0, 17.0, 8.0])

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mmpi_ns.ops.dispatch import operation
-from mmpi_ns.ops.motion import between
+from mmpi_priors.ops.motion import between
 
 FAR = -1e4
 """Pixel of a point behind the other image."""

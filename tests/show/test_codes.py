@@ -10,10 +10,10 @@ import pytest
 import torch
 from random_bricks import random_window, scene_of
 
-from mmpi_ns.ops.baked import reader
 from mmpi_show.bake import smoothed
 from mmpi_show.codes import coarse_differences, smoothed_codes
 from mmpi_show.files import write_baked
+from mmpi_show.ops.baked import reader
 from mmpi_show.scene import CELLS, brick_numbers, most_of_copies, neighbours, take_borders
 
 

@@ -16,9 +16,10 @@ from browser import CHROMIUM, browser, served
 from random_bricks import random_window, scene_of
 
 import mmpi_ns
-from mmpi_ns.ops.baked.reader import camera_rays
+import mmpi_show
 from mmpi_ns.scene.windows import window_shares
 from mmpi_show.files import HEADER, read_baked, write_baked
+from mmpi_show.ops.baked.reader import camera_rays
 from mmpi_show.scene import neighbours, take_borders
 from mmpi_show.web import write_page
 
@@ -278,7 +279,7 @@ def detailed(tmp_path_factory):
 
 
 def detailed_image(site, number):
-    scene = mmpi_ns.load(site, device="cpu")
+    scene = mmpi_show.load(site, device="cpu")
     size = scene.path.sizes[number].tolist()
     return mmpi_ns.render(scene, scene.path.camera_to_worlds[number], scene.path.intrinsics[number], *size).rgb.numpy()
 
