@@ -19,7 +19,7 @@ class Tape(TorchDispatchMode):
         kwargs = kwargs or {}
         made = func(*args, **kwargs)
         if not (self.paused or func.is_view):
-            self.done.append((func, *(tree_map_only(torch.Tensor, lambda x: x.detach(), y) for y in (args, kwargs, made))))
+            self.done.append((func, *tree_map_only(torch.Tensor, lambda x: x.detach(), (args, kwargs, made))))
         return made
 
     @torch.no_grad()

@@ -181,7 +181,7 @@ class MMPIField(TexelTables):
         positions = distinct.positions.split([len(r) for r in rows])
         taps = [Taps(p.view(w.shape), w) for p, (_, w) in zip(positions, parts)]  # noqa: B905
         read = (distinct.unique, *(read_rows(table, distinct.unique) for table in (self.density, self.features)))
-        return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read, distinct.count)
+        return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read, distinct=distinct.count)
 
     def get_outputs(  # type: ignore[override]
         self,

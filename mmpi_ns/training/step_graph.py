@@ -62,8 +62,8 @@ class Recorder:
         graph = torch.cuda.CUDAGraph()
         for g in generators:
             graph.register_generator_state(g)
-        # Threads that show images meanwhile may allocate memory.
-        with torch.cuda.graph(graph, pool=self.pool, capture_error_mode="thread_local"):
+        # Threads that show images meanwhile may allocate memory, and a kernel may be compiled or loaded.
+        with torch.cuda.graph(graph, pool=self.pool, capture_error_mode="relaxed"):
             run()
         return graph
 
