@@ -114,7 +114,7 @@ class MMPIModel(Model):
             joint, placement = self._is_joint(windows), config.placement
             work = Work(
                 config.colour.feature_channels, not joint, metadata[RAYS_PER_STEP], config.sampling.threshold,
-                all_mpis=not joint and config.schedule.rays_per_mpi == "all",
+                all_mpis=not joint and config.schedule.rays_per_mpi == "all", sample_bytes=config.colour.sample_bytes,
             )  # fmt: skip
             fixed = config.plan_file is not None or placement.arrangement != "automatic"
             again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))

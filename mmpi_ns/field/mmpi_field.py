@@ -49,6 +49,13 @@ class ColourConfig:
     direction_frequencies: int = 2
     """Octaves of the positional encoding of directions."""
 
+    @property
+    def sample_bytes(self) -> int:
+        """What the network of one sample holds for its gradients: inputs, layers before and after their activation, and
+        gradients of both. 0 where rays are shaded."""
+        inputs = self.feature_channels + 6 + 6 * (self.position_frequencies + self.direction_frequencies)
+        return 4 * (2 * inputs + 6 * self.hidden_width) if self.shading == "sample" else 0
+
 
 class MMPIField(TexelTables):
     """Density, colour and reliability of all heads.

@@ -31,7 +31,7 @@ class AdamConstants(NamedTuple):
     """With the first moment's correction: lr / (1 - beta1^step)."""
 
 
-@operation()
+@operation("gpu")
 def adam_rows(
     param: Float[Tensor, "T C"],
     moments: Float[Tensor, "T 2 C"],
