@@ -5,31 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, Int16, UInt8
-from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.data.dataset import MMPIDataset
-from mmpi_ns.data.rays import Rays
+from mmpi_ns.data.rays import Rays, TrainingRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.parallel import in_order
 from mmpi_ns.utils.random_draws import generator
 from mmpi_priors.known_depth import KnownDepth, unpacked
 from mmpi_priors.new_views import SharedPoints
-
-KEYPOINT_DEPTH = "keypoint_inverse_distance"
-"""Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
-PIXEL_DEPTH = "pixel_inverse_distance"
-"""Ray-bundle metadata [R, 2]: inverse distance of the content of a pixel and its expected error, 0 where unknown."""
-EXPOSURE = "exposure"
-"""Ray-bundle metadata [R, 3]: colour in the ray's image over colour in the field; only where exposures differ."""
-OWN_PIXEL = "is_own_pixel"
-"""Ray-bundle metadata [R, 1]: whether a ray goes through a pixel of a training image."""
 
 
 @dataclass(frozen=True)
@@ -135,8 +126,8 @@ def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[U
 
 def rays_to_keypoints(
     observations: Observations, device: str | torch.device, images: Sequence[int]
-) -> RayBundle | None:
-    """Rays from some training cameras to the SfM points that they saw, with ``KEYPOINT_DEPTH``; None if there are none.
+) -> TrainingRays | None:
+    """Rays from some training cameras to the SfM points that they saw; None if there are none.
 
     A ray goes to the point itself, a fraction of a pixel from the keypoint, so no lens model is needed.
     """
@@ -150,7 +141,7 @@ def rays_to_keypoints(
     parts = origins, (points - origins) / distance, 1 / distance
     origins, directions, inverse = (torch.from_numpy(x).float().to(device) for x in parts)
     numbers = torch.from_numpy(cameras)[:, None].to(device)
-    return RayBundle(origins, directions, torch.ones_like(inverse), numbers, metadata={KEYPOINT_DEPTH: inverse})
+    return TrainingRays(origins, directions, torch.ones_like(inverse), numbers, keypoint_disparities=inverse)
 
 
 @dataclass(frozen=True)
@@ -159,7 +150,7 @@ class RaySources:
 
     pixels: PixelPool
     new_views: SharedPoints | None
-    keypoints: RayBundle | None
+    keypoints: TrainingRays | None
     """By ``rays_to_keypoints``."""
     rays: Rays
     """Makes rays through pixel centres (image, row, column)."""
@@ -212,13 +203,12 @@ class RaySources:
 
     def draw(
         self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
-    ) -> tuple[RayBundle, dict[str, Tensor]]:
+    ) -> tuple[TrainingRays, dict[str, Tensor]]:
         """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and what images say of them.
 
         Returns:
-            The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH, OWN_PIXEL and EXPOSURE in their metadata. The batch: ``image``,
-            colours of the rays of pixels and new views, at the exposure of the field [R, C], and ``indices``, image,
-            row and column of the pixels [N, 3].
+            The rays. The batch: ``image``, colours of the rays of pixels and new views, at the exposure of the field
+            [R, C], and ``indices``, image, row and column of the pixels [N, 3].
         """
         colors, indices, depths = self.pixels.draw(pixel_rays, g)
         if self.exposures is not None:
@@ -229,16 +219,20 @@ class RaySources:
             views, seen, distances = self.new_views.draw(new_view_rays, self.rays, g, self.exposures)
             bundles.append(views)
             colors, depths = torch.cat([colors, seen]), torch.cat([depths, distances])
-        keypoint_depths = torch.zeros(len(colors), 1, device=device)
+        at_keypoints = torch.zeros(len(colors), 1, device=device)
         if self.keypoints is not None and keypoint_rays:
             chosen = torch.randint(len(self.keypoints), (keypoint_rays,), generator=g, device=g.device)
-            bundles.append(self.keypoints[chosen.to(device)])
-            keypoint_depths = torch.cat([keypoint_depths, bundles[-1].metadata[KEYPOINT_DEPTH]])
+            drawn = self.keypoints[chosen.to(device)]
+            bundles.append(drawn)
+            at_keypoints = torch.cat([at_keypoints, cast(Tensor, drawn.keypoint_disparities)])
             depths = torch.cat([depths, depths.new_zeros(keypoint_rays, 2)])
         fields = ("origins", "directions", "pixel_area", "camera_indices")
-        joined = {name: torch.cat([getattr(bundle, name) for bundle in bundles]) for name in fields}
-        is_own_pixel = (torch.arange(len(depths), device=device) < len(indices))[:, None]
-        metadata = {OWN_PIXEL: is_own_pixel, KEYPOINT_DEPTH: keypoint_depths, PIXEL_DEPTH: depths}
-        if self.exposures is not None:
-            metadata[EXPOSURE] = self.exposures[joined["camera_indices"][:, 0]]
-        return RayBundle(**joined, metadata=metadata), {"image": colors, "indices": indices}
+        joined: dict[str, Any] = {name: torch.cat([getattr(bundle, name) for bundle in bundles]) for name in fields}
+        rays = TrainingRays(
+            **joined,
+            keypoint_disparities=at_keypoints,
+            disparities=depths,
+            exposures=None if self.exposures is None else self.exposures[joined["camera_indices"][:, 0]],
+            through_pixel=(torch.arange(len(depths), device=device) < len(indices))[:, None],
+        )
+        return rays, {"image": colors, "indices": indices}

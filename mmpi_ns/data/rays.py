@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.camera_utils import radial_and_tangential_undistort
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
@@ -35,6 +35,20 @@ GRID = 17
 """Grid points along each side of an image, for placement."""
 BENT = (CameraType.FISHEYE, CameraType.FISHEYE624, CameraType.EQUIRECTANGULAR)
 """Camera types that are not pinholes, whatever their distortion."""
+
+
+@dataclass
+class TrainingRays(RayBundle):
+    """Rays of a training step, with what the capture tells of each. Fields are None where it tells nothing of any."""
+
+    keypoint_disparities: Float[Tensor, "*batch 1"] | None = None
+    """Inverse distance of the SfM point on a keypoint ray, 0 on other rays."""
+    disparities: Float[Tensor, "*batch 2"] | None = None
+    """Inverse distance of the content of a pixel and its expected error, 0 where unknown."""
+    exposures: Float[Tensor, "*batch 3"] | None = None
+    """Colour in the ray's image over colour in the field."""
+    through_pixel: Bool[Tensor, "*batch 1"] | None = None
+    """Whether the ray goes through a pixel of a training image, from its camera."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
-from mmpi_ns.data.ray_sources import KEYPOINT_DEPTH
+from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.field.tables import Lookup
@@ -137,8 +137,8 @@ def render_rays(
             tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
     composite = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
     # Keypoint rays, whose points have a known depth and no pixel, are supervised in depth alone: no colours for them.
-    keypoint_depths = None if lookup is None else bundle.metadata.get(KEYPOINT_DEPTH)
-    chosen = None if keypoint_depths is None else keypoint_depths[:, 0] == 0
+    keypoints = bundle.keypoint_disparities if isinstance(bundle, TrainingRays) and lookup is not None else None
+    chosen = None if keypoints is None else keypoints[:, 0] == 0
     rgb, sums = field.render_colors(bundle, samples, lookup, composite, chosen)
     return RenderedRays(bundle, samples, composite, rgb, sums, lookup)
 

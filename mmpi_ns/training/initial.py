@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.data.ray_sources import PIXEL_DEPTH, RaySources
+from mmpi_ns.data.ray_sources import RaySources
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.geometry import inverse_distance, plane_hits, sample_disparity
@@ -123,7 +123,8 @@ def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:
     for i in range(BATCHES):
         rays, batch = sources.draw(BATCH, generator(seed, i, "initial", field.density.device))
         count = len(batch["image"])
-        depths = rays.metadata[PIXEL_DEPTH][:count]
+        assert rays.disparities is not None
+        depths = rays.disparities[:count]
         measured = (depths[:, 0] > 0).nonzero()[:, 0]
         parts = rays.origins[measured], rays.directions[measured], depths[measured], batch["image"][measured, :3]
         votes.add(field.layout, *parts, field.plan.ray_near)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.data.ray_sources import EXPOSURE, KEYPOINT_DEPTH, PIXEL_DEPTH
+from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.depth_sums import DepthSums, depth_sums
 from mmpi_ns.rendering.rendered import RenderedRays
@@ -121,7 +121,7 @@ def batch_losses(
     """All losses of a training batch, each times its weight; and the squared colour error of each ray.
 
     Args:
-        rays: pixel rays, then keypoint rays.
+        rays: of ``TrainingRays``: pixel rays, then keypoint rays.
         field: rendered for these rays.
         image: [P, 3 or 4] colours of the pixels.
         weight: of each loss.
@@ -132,7 +132,8 @@ def batch_losses(
     Returns:
         Losses by name, and errors without gradients, 0 for keypoint rays.
     """
-    exposure = rays.bundle.metadata.get(EXPOSURE)
+    told = rays.bundle
+    assert isinstance(told, TrainingRays)
     # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
     asked, size, device = len(image), len(rays.bundle) // rays.times, image.device
     every = torch.arange(rays.times * size, device=device).view(rays.times, size)
@@ -145,25 +146,22 @@ def batch_losses(
     shown = (rays.rgb, rays.sums.mass, rays.sums.first, rays.sums.second, rays.composite.transmittance)
     colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in shown)
     rgb = colors + transmittance * background
-    sums = _depth_sums(rays, field)
+    sums = _depth_sums(rays, told, field)
+    exposure = None if told.exposures is None else told.exposures.index_select(0, pixels)
     total = {
-        "rgb_loss": photometric(rgb, observed, None if exposure is None else exposure.index_select(0, pixels)),
+        "rgb_loss": photometric(rgb, observed, exposure),
         "point_color": weight.point_color * point_color(mass, first, second, observed),
         "entropy": weight.background_entropy * background_entropy(transmittance),
         "distortion": weight.distortion * sums.spread.index_select(0, pixels).mean(),
     }
-    if KEYPOINT_DEPTH in rays.bundle.metadata and len(keypoints):
+    if len(keypoints):
         reached = sums.reached[keypoints]
         total["keypoint_depth"] = weight.keypoint_depth * known_depth(
             sums.mass.index_select(0, keypoints), reached, KEYPOINT_OUTLIERS, reached.sum().clamp(min=1)
         )
-    if PIXEL_DEPTH in rays.bundle.metadata and weight.known_depth > 0:
-        total["known_depth"] = (
-            weight.known_depth
-            * decay
-            * known_depth(
-                sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers, max(1, len(pixels))
-            )
+    if told.disparities is not None and weight.known_depth > 0:
+        total["known_depth"] = (weight.known_depth * decay) * known_depth(
+            sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers, max(1, len(pixels))
         )
     if rays.lookup is not None and step % TV_EVERY == 0 and field.density.requires_grad:
         variation = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features, weight.tv_chroma)
@@ -172,18 +170,16 @@ def batch_losses(
     return total, errors.new_zeros(len(rays.bundle)).index_copy(0, pixels, errors)
 
 
-def _depth_sums(rays: RenderedRays, field: MMPIField) -> DepthSums:
+def _depth_sums(rays: RenderedRays, told: TrainingRays, field: MMPIField) -> DepthSums:
     """Of all rays; the target is a keypoint or the known depth of a pixel."""
-    samples, bundle = rays.samples, rays.bundle
-    targets = bundle.metadata.get(PIXEL_DEPTH)
-    targets = bundle.origins.new_zeros(len(bundle), 2) if targets is None else targets
+    samples, targets = rays.samples, told.disparities
+    targets = told.origins.new_zeros(len(told), 2) if targets is None else targets
     # The spacing of planes in inverse distance: a surface between two is represented by both. Of the densest ones, as
     # an MPI of few planes may stand at a camera, for which they do.
     spacings = [1 / (m.near * max(1, m.planes - 1)) for m in field.plan.mpis]
     least = PLANE_ERROR * min(spacings, default=0.0)
     targets = torch.stack([targets[:, 0], (targets[:, 1] ** 2 + least**2).sqrt().clamp(min=1e-12)], -1)
-    if KEYPOINT_DEPTH in bundle.metadata:
-        keypoints = bundle.metadata[KEYPOINT_DEPTH]
+    if (keypoints := told.keypoint_disparities) is not None:
         windows = torch.cat([keypoints, KEYPOINT_WIDTH * keypoints], -1)
         targets = torch.where(keypoints > 0, windows, targets)
     weights, intervals = rays.composite.weights, 1 / samples.live.clamp(min=1).to(rays.rgb)

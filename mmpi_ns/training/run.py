@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from mmpi_ns.data.datamanager import MMPIDataManager
-from mmpi_ns.data.ray_sources import OWN_PIXEL
+from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.placement.split import cameras_of
 from mmpi_ns.rendering.window_store import WindowStore
@@ -83,7 +83,8 @@ def move_rays(bundle: RayBundle, poses: CameraOptimizer) -> None:
     if poses.config.mode == "off":
         return
     poses.apply_to_raybundle(bundle)
-    moves_camera = bundle.metadata[OWN_PIXEL]
+    assert isinstance(bundle, TrainingRays) and bundle.through_pixel is not None
+    moves_camera = bundle.through_pixel
     bundle.origins = torch.where(moves_camera, bundle.origins, bundle.origins.detach())
     bundle.directions = torch.where(moves_camera, bundle.directions, bundle.directions.detach())
 

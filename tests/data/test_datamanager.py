@@ -17,7 +17,6 @@ from training_runs import datamanager, in_capture_frame, plan_of
 
 from mmpi_ns.data import rays
 from mmpi_ns.data.checks import say_once
-from mmpi_ns.data.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
 from mmpi_ns.data.rays import CameraRays, image_rays
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scene.plan import ScenePlan
@@ -88,7 +87,7 @@ def test_a_batch_holds_the_colours_of_the_pixels_that_its_rays_pass(manager):
     )
     assert torch.allclose(rays.directions[:64], wanted.directions, atol=1e-6)
     assert torch.allclose(rays.origins[:64], wanted.origins)
-    assert (rays.metadata[KEYPOINT_DEPTH][:64] == 0).all() and (rays.metadata[KEYPOINT_DEPTH][64:] > 0).all()
+    assert (rays.keypoint_disparities[:64] == 0).all() and (rays.keypoint_disparities[64:] > 0).all()
 
 
 def test_every_training_pixel_can_be_drawn(manager):
@@ -195,7 +194,7 @@ def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie
 
 def test_a_keypoint_ray_ends_on_its_point_at_the_known_distance(manager):
     rays, _ = manager.next_train(3)
-    ends = rays.origins[64:] + rays.directions[64:] / rays.metadata[KEYPOINT_DEPTH][64:]
+    ends = rays.origins[64:] + rays.directions[64:] / rays.keypoint_disparities[64:]
     gaps = np.linalg.norm(ends.numpy()[:, None] - wall_in_scene_units(manager)[None], axis=-1).min(1)
     assert gaps.max() < 2e-3
 
@@ -203,7 +202,7 @@ def test_a_keypoint_ray_ends_on_its_point_at_the_known_distance(manager):
 def test_without_a_colmap_model_or_on_request_there_are_no_keypoint_rays(scene, tmp_path):
     bare = datamanager(write_scene(tmp_path / "bare", sfm=False))
     rays, _ = bare.next_train(0)
-    assert len(rays) == 64 and (rays.metadata[KEYPOINT_DEPTH] == 0).all()
+    assert len(rays) == 64 and (rays.keypoint_disparities == 0).all()
     assert len(datamanager(scene, keypoint_rays=0).next_train(0)[0]) == 64
 
 
@@ -221,8 +220,8 @@ def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(s
     rays, batch = manager.next_train(2)
     assert batch["image"].shape == (64 + 16, 3) and len(rays) == 64 + 16 + 12
     views = slice(64, 64 + 16)
-    assert (rays.metadata[PIXEL_DEPTH][views] > 0).all() and (rays.metadata[KEYPOINT_DEPTH][views] == 0).all()
-    assert rays.metadata[OWN_PIXEL][:, 0].tolist() == [True] * 64 + [False] * (16 + 12)
+    assert (rays.disparities[views] > 0).all() and (rays.keypoint_disparities[views] == 0).all()
+    assert rays.through_pixel[:, 0].tolist() == [True] * 64 + [False] * (16 + 12)
     origins, directions = in_capture_frame(manager, rays.origins.double().numpy(), rays.directions.double().numpy())
     error = np.abs(batch["image"].numpy()[views] - color_of(origins[views], directions[views]))
     assert np.median(error) < 0.02, "their colours are those of the scene, seen from there"

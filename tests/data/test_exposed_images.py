@@ -11,7 +11,6 @@ from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, write_
 from training_runs import datamanager, in_capture_frame
 
 from mmpi_ns.data.datamanager import GAINS
-from mmpi_ns.data.ray_sources import EXPOSURE
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.metrics import ImageMetrics, color_corrected, psnr
 from mmpi_ns.training.losses import photometric
@@ -53,7 +52,7 @@ def test_batches_hold_colours_at_one_exposure_whichever_image_they_come_from(man
     assert np.median(np.abs(ratio[len(batch["indices"]) :] / np.median(ratio[pixels], 0) - 1)) < 0.05, "new views too"
     images = batch["indices"][:, 0]
     own = torch.from_numpy(manager.gains.from_field).float()[images]
-    torch.testing.assert_close(rays.metadata[EXPOSURE][: len(images)], own)
+    torch.testing.assert_close(rays.exposures[: len(images)], own)
 
 
 def test_colours_of_the_field_fit_its_range(manager):
@@ -69,7 +68,7 @@ def test_images_of_one_exposure_are_drawn_as_they_are(scene):
         for name in names:
             a, b = (x[name] if isinstance(x, dict) else getattr(x, name) for x in (one, other))
             assert torch.equal(a, b)
-    assert EXPOSURE not in plain.next_train(3)[0].metadata
+    assert plain.next_train(3)[0].exposures is None
 
 
 def test_exposures_that_exif_notes_as_equal_are_not_searched(exposed, monkeypatch, capsys):

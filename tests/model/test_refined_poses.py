@@ -11,12 +11,11 @@ import pytest
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
-from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.eval_utils import eval_setup
 from tiny_scene import write_scene
 from training_runs import compared, differences, load, ready, trainer_config, write_plan, write_windows
 
-from mmpi_ns.data.ray_sources import OWN_PIXEL
+from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.training.run import move_rays
 from mmpi_ns.utils.errors import InputError
 
@@ -167,7 +166,7 @@ def test_every_ray_follows_its_camera_and_pixels_of_images_alone_move_it(part):
     numbers, own = torch.tensor([[0], [1], [0], [1]]), torch.tensor([[True], [False], [False], [False]])
     ways = torch.nn.functional.normalize(torch.tensor([[1.0, 2, 3], [3, 1, 2], [1, 0, 0], [0, 1, 1]]), dim=-1)
     given = {"origins": torch.ones(4, 3), "directions": ways}
-    bundle = RayBundle(**given, pixel_area=torch.ones(4, 1), camera_indices=numbers, metadata={OWN_PIXEL: own})
+    bundle = TrainingRays(**given, pixel_area=torch.ones(4, 1), camera_indices=numbers, through_pixel=own)
     move_rays(bundle, poses)
     moves = poses(numbers[:, 0])
     wanted = {
