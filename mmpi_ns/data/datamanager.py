@@ -21,12 +21,13 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mmpi_ns.data.checks import PARSER_OPTIONS, check_transforms, colmap_models, say_once
 from mmpi_ns.data.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.data.exif import light_of
 from mmpi_ns.data.ray_sources import PixelPool, RaySources, rays_to_keypoints
-from mmpi_ns.data.rays import CameraRays
+from mmpi_ns.data.rays import CameraRays, TrainingRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
@@ -41,7 +42,7 @@ from mmpi_priors.observe import drop_masked, observe, posed_images
 from mmpi_priors.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
 from mmpi_priors.tracks import at_full_size
 
-Batch = tuple[RayBundle, dict[str, Any]]
+Batch = tuple[TrainingRays, dict[str, Tensor]]
 Parser = Literal["auto", "nerfstudio", "colmap"]
 OBSERVATIONS = "mmpi_observations"
 """Key of the scene's Observations in the data set's metadata, for the model."""
