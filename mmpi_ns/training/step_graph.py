@@ -23,7 +23,6 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from mmpi_ns.data.datamanager import MMPIDataManager
-from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import Capacity
 from mmpi_ns.training.agreement import CLOSE, on_same_rows
@@ -104,15 +103,13 @@ class StepGraphs:
     """Trains a model on a GPU, with graphs once it is known how much room steps need.
 
     Args:
-        model: to train.
+        model: ``MMPIModel``, to train.
         manager: its rays.
         optimizers: by kind of parameter.
         recorder: of graphs.
     """
 
-    def __init__(
-        self, model: MMPIModel, manager: MMPIDataManager, optimizers: dict[str, Any], recorder: Any = None
-    ) -> None:
+    def __init__(self, model: Any, manager: MMPIDataManager, optimizers: dict[str, Any], recorder: Any = None) -> None:
         self.model, self.manager, self.optimizers = model, manager, optimizers
         self.new_recorder = recorder or Recorder
         self.generators: tuple[Generators, ...] = (manager.draws, model.draws)
