@@ -11,16 +11,16 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from nerfstudio.model_components.lib_bilagrid import color_correct
 from numpy.typing import NDArray
 from plane_crossings import images_of
 from report import Bench, Report, Row, page, table
 from torch import Tensor
 
-from mmpi_ns.rendering.metrics import color_corrected
+from mmpi_ns.data.posed_images import posed_images
 from mmpi_ns.rendering.pipeline import refined_camera
 from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.errors import InputError
-from mmpi_priors.observe import posed_images
 from mmpi_priors.views import look_up, project
 from mmpi_show.bake import load_model
 
@@ -79,11 +79,11 @@ def causes(pipeline: Any, count: int) -> Row:
         with torch.enable_grad():
             moved = refined_camera(model, camera, image, model.config.seed + i)[0]
         again = pipeline.as_exposed(moved, model.get_outputs_for_camera(moved), image)
-        plain, fitted = squared(outputs["rgb"], image), squared(color_corrected(again["rgb"], image), image)
+        plain, fitted = squared(outputs["rgb"], image), squared(color_correct(again["rgb"], image), image)
         seen = times_seen(camera, outputs["depth"][..., 0].cpu().numpy(), posed, distances)
         for name, error in (
             ("test images", plain),
-            ("... colours fitted", squared(color_corrected(outputs["rgb"], image), image)),
+            ("... colours fitted", squared(color_correct(outputs["rgb"], image), image)),
             ("... own pose refined", squared(again["rgb"], image)),
             ("... both", fitted),
         ):

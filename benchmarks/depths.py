@@ -76,7 +76,7 @@ def depths_of(data: Path, downscale_factor: int) -> Row:
     config.mask_moving, config.depth_images, config.dataparser.downscale_factor = False, False, downscale_factor
     start = time.process_time()
     manager = config.setup(device="cpu", test_mode="val")
-    seconds, dataset, known = time.process_time() - start, manager.train_dataset, manager.known_depth
+    seconds, dataset, known = time.process_time() - start, manager.train_dataset, manager.depth_priors
     assert known is not None
     count = len(dataset)
     row: Row = {"images": count, "seconds_an_image": seconds / count, "share": known.share}

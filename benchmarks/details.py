@@ -15,12 +15,12 @@ import torch
 from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import clock
+from mmpi_ns.data.dataset import image_and_mask
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering import details
 from mmpi_ns.rendering.metrics import psnr, ssim
 from mmpi_ns.scripts.command import run
 from mmpi_ns.training.checkpoints import checkpoints_in
-from mmpi_priors.new_views import image_and_mask
 from mmpi_show.bake import load_model
 
 NEAREST = (2, 4, 6, 8)

@@ -69,7 +69,12 @@ class ExposureBench(Bench):
     def _row(self, data: Path, downscale_factor: int) -> Row:
         row = calibration(data, downscale_factor)
         for name, option in (("with", "True"), ("without", "False")) if self.steps else ():
-            options = ["--pipeline.datamanager.correct-exposure", option, "--max-num-iterations", str(self.steps)]
+            options = [
+                "--pipeline.datamanager.priors.correct-exposure",
+                option,
+                "--max-num-iterations",
+                str(self.steps),
+            ]
             options += ["--pipeline.model.lpips-net", "none"]
             place = self.folder / f"{data.resolve().name}-{name}"
             _, scores, made = train_and_evaluate(

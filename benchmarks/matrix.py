@@ -57,7 +57,7 @@ def options(capture: Capture) -> dict[str, Any]:
     length = max(STEP * (capture.images - 1) / DISTANCE / 2.5, 0.01) if capture.windows == "several" else 0.0
     return {
         "pipeline.model.placement.window_length": length,
-        "pipeline.datamanager.dense_depth": capture.megapixels <= MOST_MATCHED,
+        "pipeline.datamanager.priors.dense_depth": capture.megapixels <= MOST_MATCHED,
         "pipeline.datamanager.dataparser.load_3D_points": capture.depth == "points",
     }
 

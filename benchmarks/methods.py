@@ -15,10 +15,10 @@ TWO_PHASE = ("--pipeline.model.schedule.training", "two-phase")
 SPLIT = ("--pipeline.model.schedule.rays-per-mpi", "split")
 NO_DEPTH = (
     *("--pipeline.datamanager.keypoint-rays", "0"),
-    *("--pipeline.datamanager.dense-depth", "False"),
-    *("--pipeline.datamanager.depth-images", "False"),
+    *("--pipeline.datamanager.priors.dense-depth", "False"),
+    *("--pipeline.datamanager.priors.depth-images", "False"),
 )
-POSES_ALONE = ("--pipeline.datamanager.sfm-path", "none")
+POSES_ALONE = ("--pipeline.datamanager.priors.sfm-path", "none")
 """A COLMAP model or point cloud that the scene has is not read."""
 
 

@@ -19,11 +19,10 @@ from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.config import mmpi_small
+from mmpi_ns.data.posed_images import at_full_size, posed_images
 from mmpi_ns.scripts.command import run
 from mmpi_priors.dense import find_depths
 from mmpi_priors.moving import COMPARED, ROUNDS, SIDE, key_images, moving_masks
-from mmpi_priors.observe import posed_images
-from mmpi_priors.tracks import at_full_size
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 from mmpi_scene.movers import MOVER, with_movers
@@ -82,7 +81,7 @@ class MovingBench(Bench):
 
     def _trained(self, movers: int, mask: bool) -> Row:
         """Scores of the test images, which hold no movers."""
-        options = ["--pipeline.datamanager.mask-moving", str(mask), "--max-num-iterations", str(self.steps)]
+        options = ["--pipeline.datamanager.priors.mask-moving", str(mask), "--max-num-iterations", str(self.steps)]
         options += ["--pipeline.model.lpips-net", "none"]
         data, place = self._street(*STREETS[0], movers), self.folder / f"trained-{movers}-{mask}"
         _, scores, made = train_and_evaluate(Scene(data, 1), place, "mmpi-small", options, (), self.cores)

@@ -7,10 +7,11 @@ import itertools
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from plyfile import PlyData
 from torch import Tensor, nn
 
-from mmpi_ns.data.dataset import parser_points
 from mmpi_ns.ops.interpolate import weigh_rows
 
 
@@ -32,8 +33,19 @@ def leave_lpips_out() -> None:
     home.LearnedPerceptualImagePatchSimilarity = NoLPIPS  # type: ignore[misc]
 
 
+def parser_points(path: Path, transform_matrix: Tensor, scale_factor: float) -> dict[str, Tensor]:
+    """The point cloud of a PLY file, moved to the scene's axes [3, 4] and scaled, as nerfstudio's parser returns it."""
+    points = PlyData.read(path)["vertex"]
+    xyz, rgb = (
+        torch.from_numpy(np.stack([np.asarray(points[name]) for name in names], -1))
+        for names in (("x", "y", "z"), ("red", "green", "blue"))
+    )
+    places = (xyz.float() @ transform_matrix[:, :3].T + transform_matrix[:, 3]) * scale_factor
+    return {"points3D_xyz": places, "points3D_rgb": rgb}
+
+
 def read_points_ourselves() -> None:
-    """Makes nerfstudio's data parser read point clouds by ``parser_points`` in this process."""
+    """Makes nerfstudio's data parser read point clouds without open3d in this process."""
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 
     Nerfstudio._load_3D_points = lambda self, *given: parser_points(*given)  # type: ignore[method-assign]
@@ -51,7 +63,7 @@ def give_depths(data: Path, downscale_factor: int) -> None:
 
     parser = NerfstudioDataParserConfig(data=data, downscale_factor=downscale_factor)
     manager = MMPIDataManagerConfig(data=data, dataparser=parser).setup(device="cpu", test_mode="val")
-    names, known = manager.train_dataset.image_filenames, manager.known_depth
+    names, known = manager.train_dataset.image_filenames, manager.depth_priors
     if known is None or known.share == 0:
         raise ValueError(f"{data}: no depth is known of any training pixel.")
     inverse = {name: torch.from_numpy(known.image(i)[..., :1]) for i, name in enumerate(names)}

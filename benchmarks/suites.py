@@ -93,7 +93,7 @@ SUITES: dict[str, list[Method]] = {
 }
 
 NO_VIEWS = ("--pipeline.datamanager.new-view-share", "0")
-NO_DENSE = ("--pipeline.datamanager.dense-depth", "False")
+NO_DENSE = ("--pipeline.datamanager.priors.dense-depth", "False")
 ABLATIONS: dict[str, list[Method]] = {
     # What the depths are worth that are found in the training images, from poses alone and beside SfM tracks.
     "depth": [

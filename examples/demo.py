@@ -137,7 +137,7 @@ class Demo:
             "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
             "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
             "--pipeline.model.lpips-net", "none",  # would download half a gigabyte of weights
-            "--pipeline.datamanager.depth-images", "False",  # the scene has exact depths, an ordinary capture has none
+            "--pipeline.datamanager.priors.depth-images", "False",  # exact depths, which captures have not
             *(["--load-dir", str(self.run / "nerfstudio_models")] if newest is not None else []),
         )  # fmt: skip
         if not self.checkpoint.is_file():

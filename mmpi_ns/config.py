@@ -11,6 +11,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from mmpi_ns.data.datamanager import MMPIDataManagerConfig
+from mmpi_ns.data.priors import PriorsConfig
 from mmpi_ns.field.mmpi_field import ColourConfig
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import DEFAULTS
@@ -25,11 +26,8 @@ from mmpi_ns.training.trainer import MMPITrainerConfig
 
 PAPER_DATA = {
     "keypoint_rays": 0,
-    "dense_depth": False,
-    "depth_images": False,
-    "mask_moving": False,
     "new_view_share": 0.0,
-    "correct_exposure": False,
+    "priors": PriorsConfig(dense_depth=False, depth_images=False, mask_moving=False, correct_exposure=False),
 }
 """The paper trains on the colours of pixels alone; no point cloud is read either."""
 PAPER_SCHEDULE = ScheduleConfig(decay_from=0.0, decay_decades=1.5, release_weight=0.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from threading import current_thread, main_thread
@@ -19,7 +18,7 @@ from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
 
-from mmpi_ns.data.datamanager import DEPTHS_KNOWN, GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
+from mmpi_ns.data.datamanager import CAPTURE, Capture
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
@@ -106,14 +105,17 @@ class MMPIModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         config = self.config
-        metadata, device = self.kwargs.get("metadata", {}), self.kwargs.get("device", "cpu")
-        views, observations = metadata.get(TRAINING_VIEWS), metadata.get(OBSERVATIONS)
-        self.trains = OBSERVATIONS in metadata
+        self.capture: Capture | None = self.kwargs.get("metadata", {}).get(CAPTURE)
+        """What is known of the training images; None where the plan comes from a checkpoint."""
+        capture, device = self.capture, self.kwargs.get("device", "cpu")
+        views = None if capture is None else capture.views
         windows = self._plan(config.placement)
-        if self.trains:  # fewer texels than the rule would like, where they do not fit in the memory that is free
+        if (
+            capture is not None
+        ):  # fewer texels than the rule would like, where they do not fit in the memory that is free
             joint, placement = self._is_joint(windows), config.placement
             work = Work(
-                config.colour.feature_channels, not joint, metadata[RAYS_PER_STEP], config.sampling.threshold,
+                config.colour.feature_channels, not joint, capture.rays_per_step, config.sampling.threshold,
                 all_mpis=not joint and config.schedule.rays_per_mpi == "all", sample_bytes=config.colour.sample_bytes,
             )  # fmt: skip
             fixed = config.plan_file is not None or placement.arrangement != "automatic"
@@ -121,12 +123,12 @@ class MMPIModel(Model):
             windows = fit_memory(windows, lambda window: views_of(window, views), work, device, again)
         phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
         count = len(windows)
-        schedule = make_schedule(phases, max(1, config.total_steps), count, metadata.get(DEPTHS_KNOWN, False))
+        schedule = make_schedule(phases, max(1, config.total_steps), count, capture is not None and capture.has_depths)
         self.progress = Progress(windows, schedule)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget)
-        self.exposures = Exposures(metadata.get(GAINS), None if views is None else views.origins)
+        self.exposures = Exposures(None if capture is None else capture.gains)
         self.details: Details | None = None
         self.metrics = ImageMetrics(config.lpips_net)
         self.draws = Generators(config.seed, device)
@@ -135,8 +137,6 @@ class MMPIModel(Model):
         self.register_buffer("decay", torch.tensor(1.0), persistent=False)
         """``Schedule.decay`` of the step."""
         self.decay: Tensor
-        self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
-        """In place of ``scores_and_images`` while the pipeline evaluates images, which are exact then."""
         self.show = ViewerDropdown("Show MPI", "all", ["all"], hint="One MPI alone, or all")
         self._take_plan()
         dispatch.choose(config.ops)
@@ -146,7 +146,7 @@ class MMPIModel(Model):
                 f"The capture is trained in {count} windows, one after the other, and poses are refined in one alone: "
                 "refine them before (mmpi-prepare --refine-poses), or give --pipeline.model.placement.window-length 0."
             )
-        scale_is_free = observations is not None and not len(observations.seen_by)
+        scale_is_free = capture is not None and not len(capture.observations.seen_by)
         release, moves = config.schedule.release_weight, [*self.camera_optimizer.parameters()]
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, moves, scale_is_free)
         self.register_load_state_dict_post_hook(type(self)._take_plan)
@@ -157,18 +157,18 @@ class MMPIModel(Model):
 
     def _plan(self, placement: PlacementConfig) -> WindowedPlan:
         """Scene plan of the option, or of the placement rule for the observations of the training cameras."""
-        config, metadata = self.config, self.kwargs.get("metadata", {})
-        observations = metadata.get(OBSERVATIONS)
+        config, capture = self.config, self.capture
+        observations = None if capture is None else capture.observations
         if observations is not None and config.total_steps == 0:
             config.total_steps = steps_for(config.method, most_pixels(observations, placement), config.rays_times)
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             return WindowedPlan.load(config.plan_file)
-        if observations is None:
+        if capture is None or observations is None:
             folder = None if config.windows_folder is None else config.windows_folder.parent / "nerfstudio_models"
             if folder is not None and folder.is_dir():
                 last_checkpoint(folder)  # nerfstudio looks for it only after making the model, and ends in a traceback
             return WindowedPlan.single(NO_PLAN)
-        return place_windows(observations, placement, config.total_steps * metadata[RAYS_PER_STEP])
+        return place_windows(observations, placement, config.total_steps * capture.rays_per_step)
 
     def _new_field(self, views: TrainingViews | None = None) -> MMPIField:
         """A field of this run's settings, of the first window at the first resolution: to train, or to load into."""
@@ -263,7 +263,7 @@ class MMPIModel(Model):
         outputs = shown_outputs(bundle, field, blends=blends, threshold=threshold, head_mask=head_mask)
         behind = outputs.pop("transmittance") * background.to(outputs["rgb"])
         outputs |= winners(outputs, bundle, field, first_head)
-        exposure = self.exposures.shown(self.config.rendering.exposure, bundle)
+        exposure = self.exposures.mean
         if exposure is None:
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1)}
         radiance = outputs["rgb"] + behind / exposure
@@ -298,13 +298,13 @@ class MMPIModel(Model):
             outputs = {name: values.view(*camera_ray_bundle.shape, -1) for name, values in outputs.items()}
             if self.details is None or self.progress.windows.find(self.show.value) is not None:
                 return outputs
-            exposure = self.exposures.shown(self.config.rendering.exposure, camera_ray_bundle)
-            return self.details.added(outputs, camera_ray_bundle, self.config.rendering.nearest_images, exposure)
+            nearest = self.config.rendering.nearest_images
+            return self.details.added(outputs, camera_ray_bundle, nearest, self.exposures.mean)
 
     def update_to_step(self, step: int) -> None:
         """Is told the step of a checkpoint before it is loaded."""
         folder = self.config.windows_folder
-        if self.config.rendering.nearest_images and folder is not None and not self.trains:
+        if self.config.rendering.nearest_images and folder is not None and self.capture is None:
             self.details = details_of(folder.parent / DETAILS_FOLDER, step)
             if self.details is None:
                 say("This checkpoint has no details of the training images (they are made after the last step): images "
@@ -357,11 +357,6 @@ class MMPIModel(Model):
         return counts
 
     def get_image_metrics_and_images(
-        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        return (self.scoring or self.scores_and_images)(outputs, batch)
-
-    def scores_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics of an image, "field_..." of the field without details, the mean "dropped_mass" and, where distances

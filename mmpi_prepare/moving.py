@@ -12,10 +12,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from rich.progress import track
 
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_prepare.images import Photo
 from mmpi_prepare.poses import opencv_intrinsics
 from mmpi_priors.moving import draw_moving, find_moving, in_image
-from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import straightened_color
 
 

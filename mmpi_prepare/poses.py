@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import pycolmap
 
+from mmpi_ns.data.checks import MAP_COORDINATES
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_prepare.adjustment import Array, nearest_rotation
 from mmpi_prepare.images import IMAGES, Photo, natural_key
@@ -136,6 +137,13 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
         raise InputError(f"--poses {path} has finite poses for {len(poses)} images: at least two are needed.")
     if len(poses) < len(photos):
         say(f"{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.", "yellow")
+    centers = np.array([pose[:3, 3] for pose in poses.values()])
+    if np.abs(centers).max() > MAP_COORDINATES * np.ptp(centers, axis=0).max() > 0:
+        origin = np.round(centers.mean(0))
+        for pose in poses.values():
+            pose[:3, 3] -= origin
+        place = ", ".join(f"{x:.10g}" for x in origin)
+        read = replace(read, says=f"{read.says}, in map coordinates, of which ({place}) is subtracted")
     return replace(read, poses=poses)
 
 

@@ -26,13 +26,13 @@ import torch
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_turn, num_threads, one_thread_each
 from mmpi_priors.ops.matches import Measured, average_matches, compare_depths, follow_motion, solve_matches
 from mmpi_priors.ops.motion import find_motion
 from mmpi_priors.patches import search_surfaces
-from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import Map, Parallax, View, load_view, look_up, pixel_grid
 
 T = TypeVar("T")

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.posed_images import PosedImages, at_full_size, posed_images
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import duration
@@ -35,8 +36,6 @@ from mmpi_priors.moving_follow import upright_objects
 from mmpi_priors.moving_objects import UNASKED, followed, grown, is_static, seeds, touching
 from mmpi_priors.moving_outline import outlined
 from mmpi_priors.moving_sweep import Sweep, sweep
-from mmpi_priors.observe import posed_images
-from mmpi_priors.tracks import PosedImages, at_full_size
 from mmpi_priors.upright import upright
 from mmpi_priors.views import Parallax, View, look_up, project, straightened, straightened_color
 

@@ -8,26 +8,24 @@ new view and, since they end at the point, the empty space in front of it, which
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from nerfstudio.cameras.rays import RayBundle
 from numpy import ndarray
-from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.dataset import MMPIDataset, image_and_mask
+from mmpi_ns.data.posed_images import PosedImages
+from mmpi_ns.data.priors import DepthPriors, SharedPoints
 from mmpi_ns.data.rays import Rays
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order
 from mmpi_priors.cache import held
 from mmpi_priors.dense import TRIMMED
-from mmpi_priors.known_depth import KnownDepth
-from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import look_up, project
 
 NEIGHBOURS = 4
@@ -44,53 +42,6 @@ BYTES_OF_IMAGE = 18
 """Of a pixel of an image with the range of colours around, its mask and depths."""
 MOST = 2_000_000
 """Maximum number of pixel pairs (30 bytes each), spread over the images."""
-
-
-@dataclass(frozen=True)
-class SharedPoints:
-    """Points that two training images show at the same depth, each as a pixel of the first."""
-
-    pixels: Int[Tensor, "P 3"]
-    """Image, row and column in the first."""
-    other: Int[Tensor, "P"]
-    """The second image."""
-    colors: UInt8[Tensor, "P 2 C"]
-    """Colour in the first and the second image."""
-    depths: Float[Tensor, "P 2"]
-    """Inverse distance from the first camera, and its expected error."""
-    centers: Float[Tensor, "M 3"]
-    """Positions of all training cameras."""
-    cover: float
-    """Number of points divided by the number of pixels; limits how often each point is drawn."""
-
-    def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
-        """The points shared by two of the given images; None if there is none."""
-        images, names = images.to(self.pixels), ("pixels", "other", "colors", "depths")
-        shared = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
-        return replace(self, **{name: getattr(self, name)[shared] for name in names}) if len(shared) else None
-
-    def draw(
-        self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
-    ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
-        """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
-
-        Colours are divided by the ``exposures`` of all training images; None: they are equal.
-        """
-        device = self.pixels.device
-        chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
-        share = torch.rand(count, 1, generator=g, device=g.device).to(device)
-        first = rays(self.pixels[chosen].long())
-        depths, colors = self.depths[chosen], self.colors[chosen].float() / 255
-        if exposures is not None:
-            images = torch.stack([self.pixels[chosen, 0], self.other[chosen]], -1).long()
-            colors[..., :3] /= exposures[images]
-        origins = torch.lerp(first.origins, self.centers[self.other[chosen].long()], share)
-        # Relative to the first camera, so that the direction of distant points stays exact.
-        offsets = (first.origins - origins) * depths[:, :1] + first.directions
-        length = offsets.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-        bundle = RayBundle(origins, offsets / length, torch.ones_like(share), camera_indices=first.camera_indices)
-        # The error of a distance along the ray is about that from the first camera.
-        return bundle, torch.lerp(colors[:, 0], colors[:, 1], share), depths / torch.cat([length, length**2], -1)
 
 
 @dataclass(frozen=True)
@@ -128,7 +79,7 @@ class ShownImage:
 def find_shared_points(
     dataset: MMPIDataset,
     posed: PosedImages,
-    depths: KnownDepth,
+    depths: DepthPriors,
     rays: Rays,
     images: Sequence[int],
     seed: int,
@@ -196,15 +147,3 @@ def _matches(
         other, both = torch.full((len(seen),), j, dtype=torch.int32), np.stack([colors[seen], theirs], 1)
         parts.append((pixels[seen].int(), other, torch.from_numpy(both), torch.from_numpy(depths[seen])))
     return parts, matches
-
-
-def image_and_mask(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Colours of an image [H, W, C] and where it may be used [H, W]."""
-    data = dataset.get_data(i, image_type="uint8")
-    image = data["image"].numpy()
-    usable = np.ones(image.shape[:2], np.uint8) if "mask" not in data else data["mask"][..., 0].numpy().astype(np.uint8)
-    if image.shape[-1] == 4:
-        usable &= image[..., 3] == 255
-    elif dataset.has_alpha:
-        image = np.concatenate([image, np.full_like(image[..., :1], 255)], -1)
-    return image, usable

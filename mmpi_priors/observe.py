@@ -8,6 +8,7 @@ point is visible if no other one lies clearly in front of it, in its cell or a n
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from scipy.ndimage import minimum_filter
 
 from mmpi_ns.data.checks import say_once
 from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.posed_images import PosedImages, at_full_size, posed_images
 from mmpi_ns.data.rays import lens_directions
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
@@ -31,7 +33,7 @@ from mmpi_ns.utils.errors import InputError, quoted
 from mmpi_priors.cache import Arrays, digest, remembered
 from mmpi_priors.patches import search_surfaces
 from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
-from mmpi_priors.tracks import SAME_PLACE, PosedImages, at_full_size, triangulate
+from mmpi_priors.tracks import SAME_PLACE, triangulate
 from mmpi_priors.views import Map, load_view, pixel_grid, project
 
 Array = NDArray[np.float64]
@@ -85,7 +87,7 @@ def observe(
     data = Path(parser.data)
     folder = data.parent if data.suffix == ".json" else data
     model = find_sfm_model(folder / getattr(parser, "colmap_path", sfm_path))
-    observations = read_observations(outputs, dataset.cameras, model)
+    observations = read_observations(outputs, dataset.cameras, model, point_cloud(outputs, parser))
     if np.ptp(observations.centers, axis=0).max() <= SAME_PLACE * max(1.0, np.abs(observations.centers).max()):
         CONSOLE.print("[bold yellow]All training cameras stand in one place: no distance can be learned.")
     if find_points:
@@ -170,9 +172,52 @@ def tell_poses(off: float, image: Path) -> None:
     CONSOLE.print(f"{says}: {command} mends them.", style="bold yellow", markup=False, soft_wrap=True)
 
 
-def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
-    """Training cameras as they are used, with the SfM points and keypoints moved into their frame. Raises InputError
-    naming the image whose pose or intrinsics cannot be used."""
+def point_cloud(outputs: DataparserOutputs, parser: DataParserConfig) -> Array | None:
+    """The points of a capture's cloud [P, 3] in the scene's frame; None if it has none, or they are not asked for."""
+    given = outputs.metadata.get("points3D_xyz")
+    if given is not None:
+        return given.double().numpy()
+    data = Path(parser.data)
+    file = data if data.suffix == ".json" else data / "transforms.json"
+    if not getattr(parser, "load_3D_points", False) or not file.is_file():
+        return None
+    meta = json.loads(file.read_text(encoding="utf-8"))
+    if "ply_file_path" not in meta:
+        return None
+    points = read_ply(file.parent / meta["ply_file_path"])
+    if points is None:
+        return None
+    transform, applied = outputs.dataparser_transform.double().numpy(), np.eye(4)
+    if "applied_transform" in meta:
+        applied[:3] = meta["applied_transform"]
+    elif (file.parent / "colmap/sparse/0").exists():  # nerfstudio then takes the axes of its older exports
+        applied[:3] = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    transform = transform @ np.linalg.inv(applied)  # from the axes of the file
+    return (points @ transform[:, :3].T + transform[:, 3]) * outputs.dataparser_scale
+
+
+def read_ply(path: Path) -> Array | None:
+    """The points of a PLY file [P, 3]; None, with a warning, if it is no such file or holds none."""
+    from plyfile import PlyData, PlyParseError  # slow to import; comes with nerfstudio's viewer
+
+    try:
+        points = PlyData.read(path)["vertex"]
+        xyz = np.stack([np.asarray(points[name], dtype=np.float64) for name in "xyz"], -1)
+    except (PlyParseError, KeyError, ValueError, TypeError, OSError, MemoryError) as error:
+        says = f"{path} is not a PLY file of points ({error}): write it again."
+        say_once(f"[bold yellow]{says} Training goes on without the point cloud.")
+        return None
+    if not len(xyz):
+        say_once(f"[bold yellow]The point cloud {path} holds no point: training goes on without it.")
+        return None
+    return xyz
+
+
+def read_observations(
+    outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None, cloud: Array | None = None
+) -> Observations:
+    """Training cameras as they are used, with the SfM points and keypoints moved into their frame, and the points of a
+    cloud [P, 3]. Raises InputError naming the image whose pose or intrinsics cannot be used."""
     poses = np.array(cameras.camera_to_worlds.double().cpu())
     flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
     usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)
@@ -185,8 +230,7 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     left, _, right = np.linalg.svd(poses[:, :, :3])
     poses[:, :, :3] = left @ right
     sizes = torch.cat([cameras.width, cameras.height], -1).double().cpu().numpy()
-    cloud = outputs.metadata.get("points3D_xyz")
-    loose = None if cloud is None else usable_points(cloud.double().numpy(), poses[:, :, 3])
+    loose = None if cloud is None else usable_points(cloud, poses[:, :, 3])
     loose = loose if loose is not None and len(loose) else None
     observations = Observations(poses, np.stack(flat, -1), sizes, lens=lens_directions(cameras), loose=loose)
     if sfm is None:
@@ -222,20 +266,6 @@ def keypoint_angles(observations: Observations, cameras: Cameras) -> NDArray[np.
     offsets = observations.points[observations.seen_point] - observations.centers[observations.seen_by]
     across = np.linalg.norm(np.cross(directions, offsets), axis=-1)
     return np.arctan2(across, (directions * offsets).sum(-1))
-
-
-def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImages | None:
-    """The training images with their cameras and lenses; None where a camera is neither perspective nor fisheye."""
-    kinds = dataset.cameras.camera_type.reshape(-1).cpu()
-    is_fisheye = kinds == CameraType.FISHEYE.value
-    if not (is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all():
-        return None
-    lens = dataset.cameras.distortion_params  # k1, k2, k3, k4, p1, p2
-    lens = torch.zeros(len(dataset), 6) if lens is None else lens.reshape(len(dataset), 6).cpu()
-    lens = torch.where(is_fisheye[:, None], lens[:, :4], lens[:, [0, 1, 4, 5]])
-    files = tuple(map(Path, dataset.image_filenames))
-    cameras = observations.camera_to_worlds, observations.intrinsics, observations.sizes
-    return PosedImages(files, *cameras, distortion=lens.double().numpy(), fisheye=is_fisheye.numpy())
 
 
 def with_tracks(observations: Observations, model: SfmModel, files: Sequence[Path] | None = None) -> Observations:

@@ -23,18 +23,21 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from nerfstudio.cameras.cameras import Cameras
 from numpy import ndarray
 from numpy.typing import NDArray
 from scipy import sparse
+from torch import Tensor
 
+from mmpi_ns.data.dataset import MMPIDataset, image_and_mask
+from mmpi_ns.data.posed_images import PosedImages
+from mmpi_ns.data.priors import DepthPriors, Gains
 from mmpi_ns.data.rays import Rays
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order
 from mmpi_priors.cache import held
 from mmpi_priors.dense import TRIMMED
-from mmpi_priors.known_depth import KnownDepth
-from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import look_up, project
 
 NEIGHBOURS, MAX_ANGLE = 6, 40.0
@@ -61,14 +64,11 @@ TONE, TONE_ERROR, EXIF_ERROR = 0.5, 0.25, 0.1
 LOOSE = 1.0
 """Standard deviation of log gains, by which images without a match are tied to the mean."""
 FOLDS = 5
-AGREEMENT = 0.8
-"""Gains are used if they lower the median error of pairs that were left out to less than this fraction,"""
-SPAN, SPAN_ERRORS = 0.03, 6.0
-"""and if 80 % of the log gains span at least this, and this many of their errors."""
+OPAQUE = 0.9
+"""Accumulation from which a pixel's depth is that of a surface."""
 SAME_LIGHT = 0.03
 """Range of log exposures in EXIF within which they are equal."""
 ROUNDS = 20
-MOST_HEADROOM = 0.5
 
 
 class ColorRatios(NamedTuple):
@@ -81,59 +81,6 @@ class ColorRatios(NamedTuple):
     errors: Float[ndarray, "M"]
     falloff: Float[ndarray, "M 2"]
     """Change of r^2 and r^4 from the first to the second; r is 1 at the corners."""
-
-
-@dataclass(frozen=True)
-class Gains:
-    """Factors between the colours of images and of a reference exposure."""
-
-    factors: Float[ndarray, "N 3"]
-    """Colour in the image over colour at the reference exposure, each channel's geometric mean 1."""
-    errors: Float[ndarray, "N"]
-    """Expected errors of their logarithms."""
-    falloff: Float[ndarray, "2 3"]
-    """Log colour per r^2 and r^4, towards the corners."""
-    disagreement: float
-    """Median difference of log colours in pairs of images that were left out, without gains,"""
-    corrected: float
-    """and with them."""
-
-    @property
-    def span(self) -> float:
-        """Ratio of green factors that 80 % of the images lie between."""
-        low, high = np.quantile(self.factors[:, 1], [0.1, 0.9])
-        return float(high / low)
-
-    def describe(self) -> str:
-        """Whether and how much exposure varies, in one sentence."""
-        before, after, error = (100 * x for x in (self.disagreement, self.corrected, float(np.median(self.errors))))
-        if not self.matter and self.confirmed and np.log(self.span) > SPAN:
-            return (
-                f"Exposure is not corrected: where images show the same, colours differ by {before:.1f} %, but too few "
-                f"surfaces are shared to tell by how much exposures do (expected error {error:.1f} %)."
-            )
-        if not self.matter:
-            return f"Exposure: equal to within {before:.1f} % where images show the same."
-        return (
-            f"Exposure varies {self.span:.2f}-fold between images and is corrected: where two show the same, colours "
-            f"that differed by {before:.1f} % differ by {after:.1f} %."
-        )
-
-    @property
-    def from_field(self) -> Float[ndarray, "N 3"]:
-        """Factors from the colours of a field, which are at most 1, to those of the images: the field is as dark as the
-        darkest image, or half as bright as the reference, so that it holds what only dark images do not clip."""
-        return self.factors / np.clip(self.factors.min(), MOST_HEADROOM, 1)
-
-    @property
-    def confirmed(self) -> bool:
-        """Whether pairs that were left out agree better with the gains than without."""
-        return self.corrected < AGREEMENT * self.disagreement
-
-    @property
-    def matter(self) -> bool:
-        """Whether images differ by more than errors explain, and the gains are confirmed."""
-        return bool(self.confirmed and np.log(self.span) > max(SPAN, SPAN_ERRORS * float(np.median(self.errors))))
 
 
 def grouped(
@@ -220,7 +167,7 @@ def pair_ratios(
 
 def color_ratios(
     cameras: PosedImages,
-    depths: KnownDepth,
+    depths: DepthPriors,
     rays: Rays,
     image_of: Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8]]],
     seed: int = 0,
@@ -339,3 +286,40 @@ def image_gains(ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] 
     logs, errors, falloff = solve(ratios, count, exposures)
     without, corrected = (float(np.median(np.concatenate(residuals[gains]))) for gains in (False, True))
     return Gains(np.exp(logs), errors, falloff, without, corrected)
+
+
+def exposure_of_image(
+    posed: PosedImages,
+    dataset: MMPIDataset,
+    factors: Tensor,
+    falloff: Tensor,
+    camera: Cameras,
+    observed: Tensor,
+    outputs: dict[str, Tensor],
+) -> Tensor | None:
+    """Exposure of an evaluated image [3], by surfaces that training images near it show too; None if they show nothing.
+
+    Args:
+        posed, dataset: the training images.
+        factors: their exposures. [M, 3]
+        falloff: of colours towards the corners. [2, 3]
+        camera: of the evaluated image.
+        observed: its colours. [H, W, 3]
+        outputs: its rendering, for the depths.
+    """
+    pose = camera.camera_to_worlds.reshape(1, 3, 4).double().cpu().numpy()
+    poses, count = np.concatenate([posed.camera_to_worlds, pose]), len(dataset)
+    nearest = nearest_views(poses, count, NEIGHBOURS, MAX_ANGLE, apart=False)
+    others = [ExposedView.of(*image_and_mask(dataset, j), None, j) for j in nearest]
+    image = (observed.cpu().numpy() * 255).round().astype(np.uint8)
+    view = ExposedView.of(image, np.ones(image.shape[:2], np.uint8), None, count)
+    seen = view.exposed & (outputs["accumulation"][..., 0] > OPAQUE).cpu().numpy()
+    pixels = np.argwhere(seen)
+    pixels = pixels[np.linspace(0, len(pixels) - 1, min(SAMPLES, len(pixels))).astype(int)]
+    coords = torch.from_numpy(pixels + 0.5).float()
+    rays = camera.to("cpu").generate_rays(torch.zeros(len(pixels), 1, dtype=torch.long), coords=coords)
+    depths = outputs["depth"].cpu()[pixels[:, 0], pixels[:, 1]]
+    points = (rays.origins + rays.directions * depths).double().numpy()
+    exposures = factors.double().cpu().numpy(), falloff.double().cpu().numpy()
+    exposure = exposure_of_view(view, others, posed, pixels, points, *exposures)
+    return None if exposure is None else torch.from_numpy(exposure).float().to(factors)

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from nerfstudio.data.utils.colmap_parsing_utils import read_model
 from numpy.typing import NDArray
 
 from mmpi_ns.utils.errors import InputError, brief
@@ -27,15 +28,11 @@ OLDEST_PYCOLMAP = 4
 """First major version with the functions that this package calls."""
 MIN_TRACK, MAX_ERROR_PX = 3, 2.0
 """Points seen by fewer images, or with a larger mean reprojection error, are too uncertain to supervise depth."""
-PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 16)
-"""Parameters of COLMAP's camera models, by model number."""
 MIN_ANGLE = 0.5
 """Minimum angle in degrees between the rays of a point; driving forward gives little more."""
 MIN_INLIERS = 15
 """Minimum number of matches of a pair: COLMAP's own limit."""
 SEED = 0
-KEYPOINT = np.dtype([("place", "<f8", 2), ("point", "<u8")])
-NO_POINT = np.uint64(2**64 - 1)
 
 
 @dataclass(frozen=True)
@@ -61,55 +58,25 @@ def find_sfm_model(path: Path) -> SfmModel | None:
     """The COLMAP model in a folder; None if there is none. Raises InputError if it cannot be read."""
     if not (path / "images.bin").is_file() and not (path / "images.txt").is_file():
         return None
-    with checked_model(path):
-        return read_reconstruction(load_pycolmap().Reconstruction(str(path)))
-
-
-@contextmanager
-def checked_model(path: Path) -> Iterator[None]:
-    """Checks the files of a model, and turns any error while reading it into one InputError."""
     try:
-        if all((path / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")):
-            # pycolmap trusts the counts in the files (https://colmap.github.io/format.html): where one is truncated or
-            # names a missing record, it would allocate gigabytes or end the process.
-            sizes = {"cameras": 24, "images": 73, "points3D": 51}
-            files = [_Reader(f"{name}.bin", (path / f"{name}.bin").read_bytes()) for name in sizes]
-            records = [file.count(least) for file, least in zip(files, sizes.values(), strict=True)]
-            cameras, images, points, seen = set(), {}, set(), [np.array([NO_POINT])]
-            for _ in range(records[0]):
-                number, model, _, _ = files[0].take("<IiQQ")
-                if not 0 <= model < len(PARAMETERS):
-                    raise ValueError(f"cameras.bin has a camera of model {model}, which is not known")
-                files[0].take(f"{8 * PARAMETERS[model]}x")
-                cameras.add(number)
-            for _ in range(records[1]):
-                number, *_, camera = files[1].take("<I7dI")
-                if camera not in cameras:
-                    raise ValueError(f"images.bin names camera {camera}, which cameras.bin has not")
-                end = files[1].data.find(b"\0", files[1].at)
-                if end < 0:
-                    raise ValueError("images.bin ends within a name")
-                files[1].at = end + 1
-                images[number] = files[1].count(24)
-                begin, _ = files[1].at, files[1].take(f"{24 * images[number]}x")
-                seen.append(np.frombuffer(files[1].data, KEYPOINT, images[number], begin)["point"])
-            for _ in range(records[2]):
-                points.add(files[2].take("<Q3d3Bd")[0])
-                (track,) = files[2].take(f"{8 * files[2].count(8)}s")
-                for image, keypoint in struct.iter_unpack("<II", track):
-                    if keypoint >= images.get(image, 0):
-                        raise ValueError(
-                            f"points3D.bin names keypoint {keypoint} of image {image}, which images.bin has not"
-                        )
-            for file in files:
-                if file.at != len(file.data):
-                    raise ValueError(f"{file.name} has {len(file.data) - file.at} bytes too many")
-            lost = set(np.unique(np.concatenate(seen)).tolist()) - {int(NO_POINT)} - points
-            if lost:
-                raise ValueError(f"images.bin names point {min(lost)}, which points3D.bin has not")
-        yield
-    except (ValueError, RuntimeError, OSError, LookupError, MemoryError, AssertionError, struct.error) as error:
+        cameras, images, points = cast(Any, read_model(str(path)))
+        images = [image for _, image in sorted(images.items())]
+        sizes = [(cameras[image.camera_id].width, cameras[image.camera_id].height) for image in images]
+    except (ValueError, TypeError, OSError, LookupError, MemoryError, AssertionError, struct.error) as error:
         raise InputError(f"The COLMAP model in {path} cannot be read ({brief(error)}): repair or remove it.") from error
+    good = [n for n, p in sorted(points.items()) if len(p.image_ids) >= MIN_TRACK and p.error <= MAX_ERROR_PX]
+    numbers = np.array(good, np.int64)
+    parts = [np.zeros((0, 4))]
+    for m, (image, size) in enumerate(zip(images, sizes, strict=True)):
+        ids = np.asarray(image.point3D_ids, np.int64)
+        rows = np.searchsorted(numbers, ids).clip(max=max(len(numbers) - 1, 0))
+        seen = numbers[rows] == ids if len(numbers) else np.zeros(len(ids), bool)
+        places = np.asarray(image.xys, np.float64).reshape(-1, 2)[seen] / size
+        parts.append(np.c_[np.full(len(places), m), rows[seen], places])
+    table = np.concatenate(parts)
+    seen_by, seen_point = table[:, :2].astype(np.int64).T
+    xyz = np.array([points[n].xyz for n in good], np.float64).reshape(-1, 3)
+    return SfmModel(xyz, np.array([image.name for image in images], np.str_), seen_by, seen_point, table[:, 2:])
 
 
 def load_pycolmap() -> ModuleType:
@@ -166,29 +133,6 @@ def numbers_in_model(files: Sequence[Path], names: Sequence[str]) -> NDArray[np.
         numbers[file] = next((whole[ending] for ending in endings if ending in whole), moved.get(file.name, -1))
     claims = Counter(numbers.values())
     return np.array([numbers[file] if claims[numbers[file]] == 1 else -1 for file in map(Path, files)], np.int64)
-
-
-@dataclass
-class _Reader:
-    """A binary file of COLMAP; never read past its end."""
-
-    name: str
-    data: bytes
-    at: int = 0
-
-    def take(self, form: str) -> tuple:
-        """The next numbers, of this form of ``struct``."""
-        begin, self.at = self.at, self.at + struct.calcsize(form)
-        if self.at > len(self.data):
-            raise ValueError(f"{self.name} ends too early, after {len(self.data)} bytes")
-        return struct.unpack_from(form, self.data, begin)
-
-    def count(self, least: int) -> int:
-        """A number of records of at least this many bytes each, which must fit into the rest of the file."""
-        (number,) = self.take("<Q")
-        if number * least > len(self.data) - self.at:
-            raise ValueError(f"{self.name} says it has {number} records and has room for fewer")
-        return number
 
 
 @contextmanager

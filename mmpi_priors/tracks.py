@@ -7,18 +7,15 @@ training images. Placement uses them to locate content, and training to supervis
 from __future__ import annotations
 
 import os
-import re
 import tempfile
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import opened
@@ -35,8 +32,6 @@ MAX_ANGLE = 60.0
 """Maximum angle in degrees between the viewing directions of matched images."""
 MIN_TRACK = 2
 """Minimum number of images of a point; with given poses, two are enough."""
-COPIES = re.compile(r"(.+)_(\d+)")
-"""Name of a folder of downscaled copies: that of the originals, and the factor."""
 EFFORTS = ((0.0067, False, 15), (0.002, True, 8))
 """Contrast of the faintest features (SIFT), whether a pair is matched again along the epipolar lines of its first
 matches, and its least inliers: for textured images, and for rooms at low resolution (two to four times slower)."""
@@ -44,98 +39,6 @@ FORMATS = {"PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "BMP": ".bmp", "TIFF": 
 """Formats that pycolmap reads, as Pillow calls them, and their endings."""
 ENOUGH = 100
 """Average number of keypoints in an image above which the thorough search is skipped."""
-
-
-@dataclass(frozen=True)
-class PosedImages:
-    """Images and their cameras."""
-
-    files: tuple[Path, ...]
-    camera_to_worlds: NDArray[np.float64]
-    """[M, 3, 4], OpenGL axes."""
-    intrinsics: NDArray[np.float64]
-    """[M, 4]: fx, fy, cx, cy in pixels."""
-    sizes: NDArray[np.float64]
-    """[M, 2]: width, height in pixels."""
-    distortion: NDArray[np.float64]
-    """[M, 4]: k1, k2, p1, p2 (OpenCV), or k1 to k4 of a fisheye lens."""
-    fisheye: NDArray[np.bool_] | bool = False
-    """Whether the lens of each image is a fisheye: [M], or one for all."""
-
-    def is_fisheye(self, i: int) -> bool:
-        """Whether image i has a fisheye lens."""
-        return bool(np.broadcast_to(self.fisheye, len(self.sizes))[i])
-
-    def is_bent(self, i: int) -> bool:
-        """True if the lens of image i is not a pinhole's; a fisheye never is, even if all its terms are 0."""
-        return self.is_fisheye(i) or bool(self.distortion[i].any())
-
-
-def original_of(file: Path) -> tuple[Path, int]:
-    """The original of a downscaled copy (``images/x.jpg`` of ``images_2/x.jpg``) and its factor, or the file and 1."""
-    for folder in file.parents:
-        if name := COPIES.fullmatch(folder.name):
-            original = folder.parent / name[1] / file.relative_to(folder)
-            if original.is_file():
-                return original, int(name[2])
-    return file, 1
-
-
-def size_of(file: Path) -> NDArray[np.float64]:
-    """Width and height of an image file. Raises InputError if it cannot be read (names it)."""
-    with opened(file) as image:
-        return np.array(image.size, np.float64)
-
-
-def shown_size(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Width and height of a file of this size as its camera shows it, which may lack a last row or column, or be of
-    another size if files are reduced when they are read."""
-    return np.where(np.abs(size - camera) <= 1, size, camera)
-
-
-def whole_of(file: Path, size: NDArray[np.float64]) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
-    """What a downscaled copy was made from, its size, and its pixels (columns, rows) in one of the copy.
-
-    A file, of this width and height, without an original, or whose original has another shape, stands for itself.
-    Raises InputError naming an image file that cannot be read.
-    """
-    original, factor = original_of(file)
-    if factor > 1:
-        whole = size_of(original)
-        if (np.abs(whole - factor * size) <= factor).all():
-            is_cut = (factor * size < whole).any() and (factor * size <= whole).all() and _is_cut(file.parent)
-            return original, whole, np.full(2, float(factor)) if is_cut else whole / size
-    return file, size, np.ones(2)
-
-
-@lru_cache(maxsize=64)
-def _is_cut(folder: Path) -> bool:
-    """Whether downscaled copies leave out the last columns and rows of originals that are no multiple of the factor.
-
-    Other programs reduce the whole image to a size that they round. The first such copy is compared with both.
-    """
-    for file in sorted(folder.iterdir()):
-        original, factor = original_of(file)
-        if factor > 1:
-            with suppress(OSError), Image.open(original) as whole, Image.open(file) as copy:
-                width, height = copy.size
-                if (factor * width, factor * height) != whole.size:
-                    gray, shown = whole.convert("L"), np.asarray(copy.convert("L"), float)
-                    cut = gray.crop((0, 0, factor * width, factor * height)).reduce(factor)
-                    reduced = gray.resize(copy.size, Image.Resampling.BOX)
-                    errors = [np.square(np.asarray(image, float) - shown).sum() for image in (cut, reduced)]
-                    return errors[0] < errors[1]
-    return False
-
-
-def at_full_size(images: PosedImages) -> PosedImages:
-    """The same views in their originals, which are sharper; a view whose original has another shape stays as it is.
-    Raises InputError naming an image file that cannot be read."""
-    copies = [size_of(file) for file in images.files]
-    files, sizes, scales = zip(*map(whole_of, images.files, copies), strict=True)
-    reduced = np.stack(copies) / [shown_size(*pair) for pair in zip(copies, images.sizes, strict=True)]
-    intrinsics = images.intrinsics * np.tile(scales * reduced, 2)
-    return replace(images, files=files, sizes=np.stack(sizes), intrinsics=intrinsics)
 
 
 def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:

@@ -14,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.utils.errors import InputError
 from mmpi_priors.ops.matches import place_pixels
-from mmpi_priors.tracks import PosedImages
 
 Map = NDArray[np.float32]
 

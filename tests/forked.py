@@ -27,7 +27,7 @@ COMMANDS = {
 CALM = {
     "machine.device_type": "cpu", "vis": "tensorboard", "max_num_iterations": 3, "experiment_name": "tiny",
     "timestamp": "run", "pipeline.datamanager.train_num_rays_per_batch": 64, "pipeline.datamanager.keypoint_rays": 16,
-    "pipeline.datamanager.dense_depth": False, "pipeline.model.colour.hidden_width": 8,
+    "pipeline.datamanager.priors.dense_depth": False, "pipeline.model.colour.hidden_width": 8,
     "pipeline.model.lpips_net": "none",
 }  # fmt: skip
 """A run of a second or so."""

@@ -29,11 +29,7 @@ COMMANDS = {
 }
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
 MAY_IMPORT |= {wing: others | {wing} for wing, others in (COMMANDS | COMPANIONS).items()}
-UPWARD = {
-    *("mmpi_ns.data.datamanager", "mmpi_ns.data.dataset", "mmpi_ns.data.ray_sources"),
-    *("mmpi_ns.model", "mmpi_ns.rendering.exposure"),
-    *("mmpi_ns.scripts.plan", "mmpi_ns.training.trainer"),
-}
+UPWARD: set[str] = set()
 """Modules of the method that still import a companion."""
 
 MODULES = {

@@ -29,7 +29,7 @@ def datamanager(data: Path, test_mode="val", **settings):
     config.keypoint_rays = 16
     config.new_view_share = 0.0
     for name, value in settings.items():
-        setattr(config, name, value)
+        setattr(config.priors if hasattr(config.priors, name) else config, name, value)
     return config.setup(device="cpu", test_mode=test_mode)
 
 

@@ -104,7 +104,7 @@ def environment() -> dict[str, Any]:
 def time_training(device: str, data: Path, work: Path) -> dict[str, Any]:
     """Milliseconds of a step and of a frame of a small capture, and what compiled operations compute otherwise than
     plain torch."""
-    manager = [f"--pipeline.datamanager.{name}" for name in ("dense-depth", "mask-moving", "correct-exposure")]
+    manager = [f"--pipeline.datamanager.priors.{name}" for name in ("dense-depth", "mask-moving", "correct-exposure")]
     options = (*drive(64, RAYS), *(word for name in manager for word in (name, "False")), *NO_TRACKS)
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of others' deprecations

@@ -1,7 +1,4 @@
-"""Checks of the input before nerfstudio reads it, whose own errors name neither frame nor remedy.
-
-The sentences are listed in docs/errors.md.
-"""
+"""Checks of the input before nerfstudio reads it, whose own errors name neither frame nor remedy."""
 
 from __future__ import annotations
 
@@ -29,6 +26,8 @@ FLOAT64_SAME = 1e-12
 """Cameras of a file closer together than this fraction of their distance from the origin count as one place."""
 ROTATION_SLACK = 0.01
 """Tolerance on the length of the axes of a pose, which should be 1."""
+MAP_COORDINATES = 2000.0
+"""Distance of the cameras from the origin, over their extent, from which 32 bits do not hold their places."""
 FAR_OFF, FEW = 1000.0, 0.1
 """A camera this many times as far away as all but a few others, this fraction of them, is a mistake."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
@@ -170,12 +169,13 @@ def _check_files(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], fr
                 raise InputError(
                     f"The {key} {cut(value)} of {path} has back slashes and is no file here: write / instead of them."
                 )
-    bare = next((f for f in frames if "depth_file_path" not in f), None)
-    if bare is not None and any("depth_file_path" in f for f in frames):
-        raise InputError(
-            f"Frame {cut(bare['file_path'])} of {path} has no depth_file_path and others have one: give all frames "
-            "one, or none."
-        )
+    for key in ("mask_path", "depth_file_path"):
+        bare = next((f for f in frames if key not in f), None)
+        if bare is not None and any(key in f for f in frames):
+            raise InputError(
+                f"Frame {cut(bare['file_path'])} of {path} has no {key} and others have one: give all frames one, or "
+                "none."
+            )
     names = [] if any(key in meta for key in SPLITS) else [frame["file_path"] for frame in frames]
     for name in names if parser.eval_mode == "filename" else ():
         if not re.search("train|eval", Path(name).name):
@@ -266,6 +266,13 @@ def check_places(
         raise InputError(
             f"All {len(centers)} camera(s) of {path} stand in one place, so no distance can be learned: give images "
             f"from two places, or learn colours alone ({parser} --auto-scale-poses False)."
+        )
+    extent = float(np.ptp(centers, axis=0).max())
+    if np.abs(centers).max() > MAP_COORDINATES * max(extent, FLOAT64_SAME):
+        raise InputError(
+            f"The cameras of {path} stand {np.abs(centers).max():.3g} from the origin and within {extent:.3g} of each "
+            "other, as in map coordinates, which lose their digits in 32 bits: mmpi-prepare IMAGES SCENE --poses "
+            f"{path} writes a scene with an origin among the cameras."
         )
     off = np.linalg.norm(centers - np.median(centers, axis=0), axis=-1)
     count, last = len(off), int(off.argmax())

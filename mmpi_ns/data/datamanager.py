@@ -1,18 +1,17 @@
-"""nerfstudio's data manager: training batches, drawn ahead, and the cameras, SfM points and depths for the model.
-
-And the observations of a scene outside training, as ``ns-train`` would pass them to placement.
-"""
+"""nerfstudio's data manager: training batches, drawn ahead, and what the model needs to know of a capture."""
 
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -24,38 +23,41 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.data.checks import PARSER_OPTIONS, check_transforms, colmap_models, say_once
-from mmpi_ns.data.dataset import MMPIDataset, take_local_origins
-from mmpi_ns.data.exif import light_of
+from mmpi_ns.data.copies import fit_cameras
+from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.priors import Gains, Priors, PriorsConfig
 from mmpi_ns.data.ray_sources import PixelPool, RaySources, rays_to_keypoints
 from mmpi_ns.data.rays import CameraRays, TrainingRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
-from mmpi_ns.utils.host import arguments, command, values_of
 from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import Generators, generator
 from mmpi_ns.utils.values import check_options
-from mmpi_priors.known_depth import KnownDepth, know_depths, of_cells
-from mmpi_priors.moving import draw_moving, moving_masks, share_of_moving
-from mmpi_priors.new_views import find_shared_points, image_and_mask
-from mmpi_priors.observe import drop_masked, observe, posed_images
-from mmpi_priors.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
-from mmpi_priors.tracks import at_full_size
 
-Batch = tuple[TrainingRays, dict[str, Tensor]]
+Batch = tuple[TrainingRays, dict[str, Any]]
 Parser = Literal["auto", "nerfstudio", "colmap"]
-OBSERVATIONS = "mmpi_observations"
-"""Key of the scene's Observations in the data set's metadata, for the model."""
-GAINS = "mmpi_gains"
-"""Key of the exposures of the training images (``photometry.Gains``); missing where they are equal."""
-DEPTHS_KNOWN = "mmpi_depths_known"
-"""Metadata: whether enough training pixels have a known depth to start training with surfaces."""
+CAPTURE = "capture"
+"""Key of the ``Capture`` in the data set's metadata, by which nerfstudio hands it to the model."""
 MANY_DEPTHS = 0.4
-"""That share of the training pixels: two thirds in most captures, a fifth in one whose images hardly overlap."""
-RAYS_PER_STEP = "mmpi_rays_per_step"
-"""Key of the pixel rays of a training step."""
-TRAINING_VIEWS = "mmpi_training_views"
-"""Key of the positions and fields of view of the training cameras (``TrainingViews``)."""
+"""Share of the training pixels with a depth prior from which training starts with surfaces: two thirds have one in most
+captures, a fifth in one whose images hardly overlap."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What a model needs to know of the training images."""
+
+    observations: Observations
+    """For placement."""
+    views: TrainingViews
+    """Positions and fields of view of the cameras."""
+    rays_per_step: int
+    """Pixel rays of a training step."""
+    has_depths: bool
+    """Whether enough pixels have a depth prior to start training with surfaces."""
+    gains: Gains | None
+    """Exposures of the images; None if they are equal."""
 
 
 @dataclass
@@ -67,49 +69,32 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """Pixel rays a training step."""
     eval_num_rays_per_batch: int = 1024
     """Rays of an evaluation batch during training."""
+    priors: PriorsConfig = field(default_factory=PriorsConfig)
+    """What the images tell beside their colours."""
     keypoint_rays: int = 384
     """Extra rays a step through SfM keypoints of training images, if few pixels have a depth shared by two images
     (scenes with tracks only)."""
-    sfm_path: Path = Path("colmap/sparse/0")
-    """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
-    triangulate: bool = True
-    """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
-    dense_depth: bool = True
-    """Match the originals of neighbouring training images densely at the start, for the depth of most pixels (about a
-    second for a million pixels on one core, on all cores; kept in ~/.cache/mmpi_ns for the next start)."""
-    depth_images: bool = True
-    """Use the depth images that a data parser lists (depth_file_path)."""
-    mask_moving: bool = True
-    """Mask what moves (cars, people) in the training images that have no mask: its pixels are not trained on."""
     new_view_share: float = 0.75
-    """Rays of new views for each pixel ray: from between two training cameras to points that both show at the same
-    known depth (0: none)."""
-    correct_exposure: bool = True
-    """Calibrate exposure and white balance of the images, by surfaces that several show and by EXIF, and compare each
-    image with the scene at its own exposure, if that explains how images differ."""
+    """Rays of new views for each pixel ray: from between two training cameras to points that both see at the same
+    depth (0: none)."""
     resident_pixels: float = 60e6
     """Training pixels held in memory at once (at most 12 bytes each). Longer captures are read window by window; if a
     window has more pixels, a random subset of this size is used. 0: window by window, all of them."""
     seed: int = field(default=0, init=False)
     """Not an option: the trainer sets it from --machine.seed. Batches depend on it and the step alone, so a resumed run
     draws what an uninterrupted one would."""
-    backdrop: float | None = field(default=None, init=False)
-    """Not an option: ns-render sets it to the gray level of the background of its images, over which it then shows the
-    originals too. nerfstudio takes four channels for features and shows their principal components."""
 
 
 class MMPIDataManager(VanillaDataManager[MMPIDataset]):
-    """Draws training batches from ``RaySources`` and hands the scene's observations to the model."""
+    """Draws training batches from ``RaySources`` and hands the capture's priors to the model."""
 
     config: MMPIDataManagerConfig
     _thread: ClassVar = ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
     """Draws the rays of the next step during this one: small operations of torch, which take the time of one core."""
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
-        self.known_depth: KnownDepth | None = None
-        self.gains: Gains | None = None
-        self.moves = ""
-        """How much of the training images moves, in a sentence; empty where nobody looked."""
+        self.priors: Priors | None = None
+        """Of a training; None where the plan comes from a checkpoint."""
         self.sources: RaySources | None = None
         """Sources that a step draws from now."""
         self.share_of_rays = 1.0
@@ -120,27 +105,23 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
         """Rays of the next step with what they are drawn from, their step and number."""
         parser: Any = config.dataparser
-        factor = getattr(parser, "downscale_factor", None)
-        if isinstance(factor, float) and factor.is_integer():  # of ns-render dataset
-            parser.downscale_factor = int(factor)
         check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
             mode = kwargs.get("test_mode", "val")
             splits = ("train", "val", "test") if mode == "val" else ("train", "test")  # for the evaluation after it too
             check_transforms(parser, Path(config.data or parser.data), splits, opens=mode != "inference")
-        take_local_origins(parser)
-        super().__init__(config, **kwargs)
-        self.train_dataset.backdrop = self.eval_dataset.backdrop = config.backdrop
-        passed = self.train_dataset if "train" in values_of("--pose-source") else self.eval_dataset
-        if command() == "ns-render" and "interpolate" in arguments() and len(passed) < 2:
-            raise InputError(
-                f"A path from image to image needs two, and its split has {passed.image_filenames[0]} alone: give "
-                "--pose-source train."
-            )
+        if isinstance(parser, NerfstudioDataParserConfig | ColmapDataParserConfig):
+            # Points are read with the other priors, in float64. nerfstudio needs open3d for them, and asks on the
+            # terminal where a capture names none.
+            parser = replace(parser, load_3D_points=False)
+        self._parser = replace(config.dataparser, data=Path(config.data or config.dataparser.data))
+        super().__init__(replace(config, dataparser=parser), **kwargs)
+        self.config.seed = config.seed
 
     def create_train_dataset(self) -> MMPIDataset:
         # First, so that what is wrong with images is said before minutes of matching.
-        self._test_images = super().create_eval_dataset()
+        self._test_images = self._test_dataset()
+        fit_cameras(self.train_dataparser_outputs, self._downscale_factor)
         self.train_dataset = dataset = super().create_train_dataset()
         if not len(dataset):
             raise InputError("The capture holds no training image: check the split that the data parser made.")
@@ -153,47 +134,39 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             images.check_files()
         self._pixels = (dataset.cameras.width * dataset.cameras.height).reshape(-1).cpu().numpy()
         """Of each training image."""
-        dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
-        dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         device = self.device
         generate = CameraRays.of(dataset.cameras, device) or RayGenerator(dataset.cameras.to(device))
         self.train_ray_generator: Any = lambda pixels: generate(pixels.to(device))
-        if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
-            if self.config.mask_moving and None in dataset.mask_files:
-                # A mask file of the user wins over what is seen to move.
-                masks, doubt = moving_masks(self.observations, dataset)
-                masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
-                self.moves = share_of_moving(masks)
-                is_masked = any(mask.any() for mask in masks)
-                say(self.moves + (" (--pipeline.datamanager.mask-moving False keeps them)." if is_masked else "."))
-                if doubt:
-                    say(doubt, "yellow")
-                if is_masked:
-                    dataset.moving = masks
-                    self.observations = drop_masked(self.observations, dataset)
-            depths, self.observations = know_depths(
-                self.train_dataparser_outputs, self.observations, dataset, self.train_ray_generator,
-                dense=self.config.dense_depth, sensor=self.config.depth_images,
+        self._maker = self.config.priors.setup(
+            outputs=self.train_dataparser_outputs, dataset=dataset, parser=self._parser,
+            rays=self.train_ray_generator, seed=self.config.seed,
+        )  # fmt: skip
+        if self.test_mode == "val":
+            self.priors = priors = self._maker.make()
+            share = 0.0 if priors.depths is None else priors.depths.share
+            dataset.metadata[CAPTURE] = Capture(
+                priors.placement, TrainingViews.of(dataset.cameras), self.config.train_num_rays_per_batch,
+                share >= MANY_DEPTHS, priors.gains,
             )  # fmt: skip
-            self.known_depth, seen = depths, self.observations
-            dataset.metadata[DEPTHS_KNOWN] = depths is not None and depths.share >= MANY_DEPTHS
-            dataset.metadata[OBSERVATIONS] = seen if depths is None else of_cells(seen, depths, dataset)
-            has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
-            if not has_keypoints and (depths is None or depths.share == 0):
+            has_keypoints = self.config.keypoint_rays > 0 and len(priors.observations.seen_at) > 0
+            if not has_keypoints and share == 0:
                 say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
 
     @cached_property
     def observations(self) -> Observations:
         """Observations of the training cameras. Only training searches the images, later perhaps absent, for points."""
-        return observe(
-            self.train_dataparser_outputs,
-            self.train_dataset,
-            self.dataparser.config,
-            self.config.sfm_path,
-            find_points=self.test_mode == "val",
-            triangulates=self.config.triangulate,
-        )
+        return self._maker.observe(find_points=False) if self.priors is None else self.priors.observations
+
+    @property
+    def _downscale_factor(self) -> int | None:
+        """Of the images that the data parser has listed."""
+        return getattr(self.dataparser, "downscale_factor", None) or getattr(self.dataparser, "_downscale_factor", None)
+
+    def _test_dataset(self) -> MMPIDataset:
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        scale = self.config.camera_res_scale_factor
+        return self.dataset_type(fit_cameras(outputs, self._downscale_factor), scale_factor=scale)
 
     def create_eval_dataset(self) -> MMPIDataset:
         if count := len(self._test_images):
@@ -208,29 +181,20 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """Reads the pixels into memory, unless there are too many, instead of nerfstudio's image cache."""
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
-        gains = self.calibrated() if self.config.correct_exposure and self.test_mode == "val" else None
-        if gains is not None:
-            say(gains.describe())
-            if gains.matter:
-                self.gains = self.train_dataset.metadata[GAINS] = gains
         if self._pixels.sum() <= self.config.resident_pixels and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
 
-    def calibrated(self) -> Gains | None:
-        """Exposures of the training images; None if EXIF says that they are equal, or nothing tells them."""
-        posed = posed_images(self.observations, self.train_dataset)
-        if self.known_depth is None or posed is None or len(posed.files) < 2:
-            return None
-        light = np.array([light_of(file) for file in at_full_size(posed).files])
-        if np.isfinite(light).all() and np.ptp(np.log(light)) < SAME_LIGHT:
-            say("Exposure: EXIF notes the same for all images.")
-            return None
-        ratios = color_ratios(
-            posed, self.known_depth, self.train_ray_generator,
-            lambda i: image_and_mask(self.train_dataset, i), self.config.seed,
-        )  # fmt: skip
-        return None if ratios is None else image_gains(ratios, len(posed.files), light)
+    def exposure_of(
+        self,
+        factors: Float[Tensor, "M 3"],
+        falloff: Float[Tensor, "2 3"],
+        camera: Cameras,
+        observed: Float[Tensor, "H W 3"],
+        outputs: dict[str, Tensor],
+    ) -> Float[Tensor, "3"] | None:
+        """Exposure of an evaluated image, by what training images near it show (``PriorsMaker.exposure_of``)."""
+        return self._maker.exposure_of(self.observations, factors, falloff, camera, observed, outputs)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
         """Draws from these training cameras from now on, None for all, and prints the share of each source. Raises
@@ -251,21 +215,16 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 f"{most / 1e6:.3g} of {total / 1e6:.3g} M training pixels are used, drawn at random: more are "
                 "held with --pipeline.datamanager.resident-pixels."
             )
-        exposures = None if self.gains is None else torch.from_numpy(self.gains.from_field).float().to(self.device)
-        depths, rays = self.known_depth, self.train_ray_generator
+        gains, depths, find = (None, None, None) if self.priors is None else (
+            self.priors.gains, self.priors.depths, self.priors.new_views
+        )  # fmt: skip
+        exposures = None if gains is None else torch.from_numpy(gains.from_field).float().to(self.device)
         pixels = PixelPool.from_dataset(self.train_dataset, self.device, images, depths, most, config.seed)
-        new_views, no_new_views = None, "no two images show a point at the same depth"
-        if config.new_view_share <= 0:
-            no_new_views = "--pipeline.datamanager.new-view-share 0"
-        elif depths is None or depths.share == 0:
-            no_new_views = "no pixel has a known depth"
-        elif (posed := posed_images(self.observations, self.train_dataset)) is None:
-            no_new_views = "a camera is neither perspective nor fisheye"
-        else:
-            chosen = images, config.seed, self.device, exposures
-            new_views = find_shared_points(self.train_dataset, posed, depths, rays, *chosen)
-        keypoints = rays_to_keypoints(self.observations, self.device, images) if self.test_mode == "val" else None
-        counts = config.new_view_share, config.keypoint_rays
+        new_views, no_new_views = None, "--pipeline.datamanager.new-view-share 0"
+        if config.new_view_share > 0 and find is not None:
+            new_views, no_new_views = find(images, self.device, exposures)
+        keypoints = None if self.priors is None else rays_to_keypoints(self.observations, self.device, images)
+        counts, rays = (config.new_view_share, config.keypoint_rays), self.train_ray_generator
         return RaySources(pixels, new_views, keypoints, rays, *counts, no_new_views, exposures)
 
     def describe(self) -> str:
@@ -276,8 +235,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         parts = [f"{len(cameras)} training and {len(self.eval_dataset)} test images of {shapes}"]
         if len(seen.points):
             parts.append(f"{len(seen.points):,} points seen {len(seen.seen_by):,} times")
-        if self.known_depth is not None:
-            parts.append(f"{100 * self.known_depth.share:.0f} % of the training pixels have a known depth")
+        if self.priors is not None and self.priors.depths is not None:
+            parts.append(f"{100 * self.priors.depths.share:.0f} % of the training pixels have a known depth")
         return f"Capture: {'; '.join(parts)}."
 
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
@@ -288,7 +247,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         dataset, most = self.train_dataset, int(self.config.resident_pixels)
         share = min(1.0, most / sizes.sum()) if most else 1.0
         # As in ``PixelPool``: colour, place in the image where it must be kept, and depth.
-        place, depth = share < 1 or dataset.has_masks, self.known_depth is not None
+        place, depth = share < 1 or dataset.has_masks, self.priors is not None and self.priors.depths is not None
         each = (4 if dataset.has_alpha else 3) + 4 * place + 4 * depth
         return each * sum(int(share * size) for size in sizes.tolist())
 
@@ -345,44 +304,33 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
 
 def load_observations(
-    data: Path, downscale_factor: int | None = None, parser: Parser = "auto", moving: Path | None = None
-) -> tuple[Observations, str]:
-    """The observations that training on a scene would use, and a sentence on what moves in its images. Raises
-    InputError if the folder holds no scene, or one that cannot be trained.
+    data: Path, downscale_factor: int | None = None, parser: Parser = "auto", search: bool = True
+) -> tuple[Observations, MMPIDataManager]:
+    """The observations that training on a scene would use for placement, and the data manager. Raises InputError if the
+    folder holds no scene, or one that cannot be trained.
 
     Args:
         data: the scene's folder.
         downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
-        moving: file for a picture of what moves. None: neither movers nor depths of pixels are searched, which takes
-            minutes; tracks or searched surfaces take their place.
+        search: for movers and depths of pixels, which takes minutes; without it tracks or searched surfaces alone.
     """
-    config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
+    config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig())
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
     if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
         models = colmap_models(data)
         if not models:
             raise InputError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
-        config.sfm_path = Path(models[0])
-        config.dataparser = ColmapDataParserConfig(colmap_path=config.sfm_path)
+        config.priors.sfm_path = Path(models[0])
+        config.dataparser = ColmapDataParserConfig(colmap_path=config.priors.sfm_path)
     parser_config = config.dataparser
     config.data = parser_config.data = data
     parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]
-    if isinstance(parser_config, NerfstudioDataParserConfig):
-        check_transforms(parser_config, data, ("train",), opens=True)
-    take_local_origins(parser_config)
-    outputs = parser_config.setup().get_dataparser_outputs(split="train")
-    if any(Path(name).is_file() for name in outputs.image_filenames):
-        # As ns-train does, so that it refuses what ns-train would refuse, and finds the depths that it would find.
-        config.mask_moving = config.dense_depth = config.depth_images = moving is not None
-        config.new_view_share, config.correct_exposure = 0.0, False  # placement asks for neither
-        manager = config.setup(device="cpu", test_mode="val")
-        masks = manager.train_dataset.moving
-        if moving is not None and masks is not None:
-            names = [Path(name).name for name in outputs.image_filenames]
-            colors = (manager.train_dataset.get_data(i, "uint8")["image"][..., :3] for i in range(len(names)))
-            draw_moving(moving, zip(names, (np.flip(x.numpy(), -1) for x in colors), strict=True), masks)
-        return manager.train_dataset.metadata[OBSERVATIONS], manager.moves
-    CONSOLE.print(f"The images of {data} are not there: its cameras and points alone are judged.")
-    cameras = MMPIDataset(outputs), parser_config, config.sfm_path
-    return observe(outputs, *cameras, find_points=True, triangulates=config.triangulate), ""
+    # As ns-train does, so that it refuses what ns-train would refuse, and finds the depths that it would find.
+    config.priors = replace(config.priors, correct_exposure=False)  # placement does not ask for it
+    if not search:
+        config.priors = replace(config.priors, mask_moving=False, dense_depth=False, depth_images=False)
+    config.new_view_share = 0.0
+    manager = config.setup(device="cpu", test_mode="val")
+    assert manager.priors is not None
+    return manager.priors.placement, manager

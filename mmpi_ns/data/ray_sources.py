@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.priors import DepthPriors, SharedPoints, unpacked
 from mmpi_ns.data.rays import Rays, TrainingRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.parallel import in_order
 from mmpi_ns.utils.random_draws import generator
-from mmpi_priors.known_depth import KnownDepth, unpacked
-from mmpi_priors.new_views import SharedPoints
 
 
 @dataclass(frozen=True)
@@ -41,14 +40,14 @@ class PixelPool:
     places: Int[Tensor, "P"] | None
     """row * width + column of each pixel; None if all pixels are here."""
     depths: Int16[Tensor, "P 2"] | None
-    """Inverse distance of each pixel and its expected error, as ``known_depth.packed``; None if none is known."""
+    """Inverse distance of each pixel and its expected error, as ``depth_priors.packed``; None if none is known."""
 
     @staticmethod
     def from_dataset(
         dataset: MMPIDataset,
         device: str | torch.device,
         images: Sequence[int],
-        known_depth: KnownDepth | None,
+        depth_priors: DepthPriors | None,
         most: int,
         seed: int,
     ) -> PixelPool:
@@ -64,7 +63,7 @@ class PixelPool:
         room = sum(int(share * size) for size in sizes)
         colors = torch.empty(room, 4 if dataset.has_alpha else 3, dtype=torch.uint8)
         places = None if whole else torch.empty(room, dtype=torch.int32)
-        depths = None if known_depth is None else torch.empty(room, 2, dtype=torch.int16)
+        depths = None if depth_priors is None else torch.empty(room, 2, dtype=torch.int16)
         starts = [0]
         for i, (image, kept) in zip(
             images, in_order(lambda i: _pixels_of(dataset, i, share, seed), images), strict=True
@@ -75,8 +74,10 @@ class PixelPool:
             colors[rows, image.shape[1] :] = 255  # opaque where the image has no alpha and another one has
             if places is not None:
                 places[rows] = kept.int()
-            if depths is not None and known_depth is not None:
-                depths[rows] = torch.from_numpy(np.require(known_depth.codes[i], requirements="W")).reshape(-1, 2)[kept]
+            if depths is not None and depth_priors is not None:
+                depths[rows] = torch.from_numpy(np.require(depth_priors.codes[i], requirements="W")).reshape(-1, 2)[
+                    kept
+                ]
         if not starts[-1]:
             raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
         rows = slice(starts[-1])

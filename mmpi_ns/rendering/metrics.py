@@ -31,7 +31,10 @@ class ImageMetrics:
 
     @torch.no_grad()
     def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
-        values = psnr_and_ssim(predicted, observed) | {"cc_psnr": psnr(color_corrected(predicted, observed), observed)}
+        from nerfstudio.model_components.lib_bilagrid import color_correct  # imports tensorly: a second
+
+        corrected = color_correct(predicted.float(), observed.float())  # as in nerfstudio's splatfacto
+        values = psnr_and_ssim(predicted, observed) | {"cc_psnr": psnr(corrected, observed)}
         if self.lpips_net != "none" and not self._lpips_tried:
             self._lpips_tried = True
             try:
@@ -76,26 +79,6 @@ def ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) ->
         )
         total += float(values[:, :, border:-border].double().sum())
     return total / predicted.numel()
-
-
-def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    """The affine map of the predicted colours (a matrix and an offset) that comes nearest to the observed ones.
-
-    Source: ``cc_psnr`` of nerfstudio's splatfacto, after MultiNeRF.
-    """
-    # Normal equations with a little of the identity: images of one colour have many solutions.
-    normal = 1e-6 * predicted[..., 0].numel() * torch.eye(4, dtype=torch.float64, device=predicted.device)
-    target = normal.new_zeros(4, 3)
-    parts = predicted.reshape(-1, 3).split(PART)
-    for colors, aim in zip(parts, observed.reshape(-1, 3).split(PART), strict=True):
-        design = pad(colors.double(), (0, 1), value=1.0)
-        normal += design.T @ design
-        target += design.T @ (aim.double() - colors.double())
-    change = torch.linalg.solve(normal, target)
-    corrected = [
-        (colors.double() + pad(colors.double(), (0, 1), value=1.0) @ change).clamp(0, 1).to(colors) for colors in parts
-    ]
-    return torch.cat(corrected).view(predicted.shape)
 
 
 def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:

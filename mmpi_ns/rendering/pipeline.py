@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from time import monotonic
+from typing import Any, cast
 
 import numpy as np
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import track
 from torch import Tensor
+from torchvision.utils import save_image
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.details import moved_cameras
-from mmpi_ns.rendering.exposure import exposure_of_image
 from mmpi_ns.utils.errors import say
 from mmpi_ns.utils.random_draws import generator
 
@@ -41,47 +43,85 @@ class MMPIPipelineConfig(VanillaPipelineConfig):
 
 
 class MMPIPipeline(VanillaPipeline):
-    """Prints PSNR and SSIM of evaluated images, with the worst and the best of them."""
+    """Scores images at their own exposure, and prints PSNR and SSIM with the worst and the best of them."""
 
     config: MMPIPipelineConfig
 
-    def get_average_image_metrics(self, data_loader: Any, image_prefix: str, *args: Any, **kwargs: Any) -> Any:
-        """Means over the images of a loader, like nerfstudio's, and a summary line."""
-        scores: list[tuple[int, dict[str, float]]] = []
-        model: Any = self.model
-        cameras = data_loader.input_dataset.cameras
-
-        def score(outputs: dict[str, Tensor], batch: Any) -> tuple[dict[str, float], dict[str, Tensor]]:
-            i, observed = int(batch["image_idx"]), model.observed(batch)
-            values, images = model.scores_and_images(self.as_exposed(cameras[i : i + 1], outputs, observed), batch)
-            if self.config.refine_eval_poses:
-                camera = cameras[i : i + 1].to(model.device)
-                camera, degrees, units = refined_camera(model, camera, observed, model.config.seed + i)
-                outputs = self.as_exposed(camera, model.get_outputs_for_camera(camera), observed)
-                refined = model.scores_and_images(outputs, batch)[0]
-                refined |= {"rotation_degrees": degrees, "translation": units}
-                values |= {REFINED + name: value for name, value in refined.items()}
-            scores.append((i, dict(values)))
-            return values, images
-
-        model.scoring = score
-        try:
-            means = super().get_average_image_metrics(data_loader, image_prefix, *args, **kwargs)
-        finally:
-            model.scoring = None
-        # Of one image nerfstudio's deviations are NaN, which is no JSON.
-        means = {name: 0.0 if math.isnan(value) and name.endswith("_std") else value for name, value in means.items()}
+    def get_average_image_metrics(
+        self,
+        data_loader: Any,
+        image_prefix: str,
+        step: int | None = None,
+        output_path: Path | None = None,
+        get_std: bool = False,
+    ) -> dict[str, float]:
+        """Means over the images of a loader, under nerfstudio's names, and a summary line."""
+        self.eval()
+        scores: list[tuple[str, dict[str, float]]] = []
         names = [Path(name).name for name in data_loader.input_dataset.image_filenames]
-        say(summary([(names[i], values) for i, values in scores]))
+        if output_path is not None:
+            output_path.mkdir(exist_ok=True, parents=True)
+        for n, (camera, batch) in enumerate(track(data_loader, "Evaluating images", console=CONSOLE, transient=True)):
+            start = monotonic()
+            values, images = self.score(camera, batch)
+            values["fps"] = 1 / (monotonic() - start)
+            values["num_rays_per_sec"] = int(camera.width) * int(camera.height) * values["fps"]
+            for name, image in images.items() if output_path is not None else ():
+                save_image(image.permute(2, 0, 1).cpu(), cast(Path, output_path) / f"{image_prefix}_{name}_{n:04d}.png")
+            scores.append((names[int(batch["image_idx"])], values))
+        means: dict[str, float] = {}
+        for name in scores[0][1]:
+            each = [values[name] for _, values in scores]
+            means[name] = float(np.mean(each))
+            if get_std:
+                means[f"{name}_std"] = float(np.std(each, ddof=1)) if len(each) > 1 else 0.0
+        say(summary(scores))
+        self.train()
         return means
 
-    def as_exposed(self, camera: Any, outputs: dict[str, Tensor], observed: Tensor) -> dict[str, Tensor]:
+    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Scores and pictures of the next test image, during training."""
+        self.eval()
+        camera, batch = self.datamanager.next_eval_image(step)
+        values, images = self.score(camera, batch)
+        values["num_rays"] = int(camera.width) * int(camera.height)
+        self.train()
+        return values, images
+
+    def score(self, camera: Cameras, batch: dict[str, Tensor]) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics and pictures of one image.
+
+        Args:
+            camera: of the image.
+            batch: the image, as the data set gives it, with ``image_idx`` in it.
+        """
+        model: Any = self.model
+        outputs, observed = self.outputs_of(camera, batch)
+        values, images = model.get_image_metrics_and_images(outputs, batch)
+        if self.config.refine_eval_poses:
+            seed = model.config.seed + int(batch["image_idx"])
+            moved, degrees, units = refined_camera(model, camera.to(model.device), observed, seed)
+            outputs = self.as_exposed(moved, model.get_outputs_for_camera(moved), observed)
+            refined = model.get_image_metrics_and_images(outputs, batch)[0]
+            refined |= {"rotation_degrees": degrees, "translation": units}
+            values |= {REFINED + name: value for name, value in refined.items()}
+        return values, images
+
+    def outputs_of(self, camera: Cameras, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
+        """The rendering of an image at its own exposure, and its colours [H, W, 3]: what every score compares."""
+        model: Any = self.model
+        observed = model.observed(batch)
+        outputs = model.get_outputs_for_camera(camera.to(model.device))
+        return self.as_exposed(camera, outputs, observed), observed
+
+    def as_exposed(self, camera: Cameras, outputs: dict[str, Tensor], observed: Tensor) -> dict[str, Tensor]:
         """The outputs at the exposure of the evaluated image itself, where exposures differ."""
         model: Any = self.model
         if "radiance" not in outputs:
             return outputs
         manager: Any = self.datamanager
-        exposure = exposure_of_image(model.exposures, manager, camera, observed, outputs)
+        exposures = model.exposures.factors, model.exposures.falloff
+        exposure = manager.exposure_of(*exposures, camera, observed, outputs)
         if exposure is None:
             say("No training image shows what an evaluated one does, or they are gone: it is scored at mean exposure.")
             return outputs

@@ -41,9 +41,6 @@ class RenderingConfig:
     """Samples of less weight are not shaded when rendering; their total weight is reported (dropped_mass)."""
     background: Literal["black", "gray", "white"] = "gray"
     """Background when rendering. Training uses random colours where the MPIs cover the whole ray."""
-    exposure: Literal["mean", "nearest"] = "mean"
-    """Exposure of images where that of the training images differs: their mean, so that films do not flicker, or that
-    of the training image taken nearest (rendered exactly)."""
     nearest_images: int = 6
     """Nearest training images whose details, which the field lacks, are added to an image (docs/details.md); 0 shows
     the field alone, and a training with 0 keeps no details."""

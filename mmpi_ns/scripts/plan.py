@@ -30,8 +30,7 @@ class PlanCommand:
     scene: tyro.conf.Positional[Path]
     """Folder with transforms.json, or with images and a COLMAP model."""
     output: Path
-    """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window), and moving.jpg
-    where anything moves."""
+    """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window)."""
     method: Literal["mmpi", "mmpi-small"] = "mmpi-small"
     """Method whose defaults are used."""
     downscale_factor: int | None = None
@@ -62,15 +61,13 @@ class PlanCommand:
                 f"{plan} was edited since mmpi-plan wrote it, or is not from there: "
                 "give another --output, or remove it."
             )
-        picture = self.output / "moving.jpg"
-        picture.unlink(missing_ok=True)
-        observations, moves = load_observations(self.scene, self.downscale_factor, self.parser, picture)
+        observations, manager = load_observations(self.scene, self.downscale_factor, self.parser)
         if windows is None:
             steps = steps_for(self.method, most_pixels(observations, self.placement))
             windows = place_windows(observations, self.placement, steps * DEFAULTS[self.method].rays)
         text = self._explain(windows, observations)
-        if moves:
-            text += f"\n\n{moves}{': moving.jpg shows it' if picture.is_file() else ''}."
+        if manager.priors is not None and manager.priors.movers:
+            text += f"\n\n{manager.priors.movers}."
         title = f"# Plan of {self.scene.resolve().name}"
         plan.write_text(windows.to_json(), encoding="utf-8")
         table.write_text(f"{title}\n\n{_mark(plan)}\n\n{text}\n", encoding="utf-8")

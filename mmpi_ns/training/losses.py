@@ -39,7 +39,7 @@ class LossWeights:
     """Spread of a ray's weights over distance (distortion)."""
     keypoint_depth: float = 0.02
     """-log of the weights near an SfM keypoint (scenes with tracks)."""
-    known_depth: float = 0.01
+    depth_priors: float = 0.01
     """-log of the likelihood of a pixel's known depth, from dense matches, an SfM point or a sensor. Falls with the
     learning rates: in the end colours are more accurate."""
     depth_outliers: float = 0.02
@@ -91,7 +91,7 @@ def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]
     return -(p * p.log() + (1 - p) * (1 - p).log()).mean()
 
 
-def known_depth(
+def depth_priors(
     mass: Float[Tensor, "R"], reached: Bool[Tensor, "R"], outliers: float, count: Int[Tensor, ""] | int
 ) -> Float[Tensor, ""]:
     """-log of the likelihood of known inverse distances given the weights along their rays, mean over ``count`` rays.
@@ -127,7 +127,7 @@ def batch_losses(
         weight: of each loss.
         g: draws the colours behind the pixels.
         step: of the training.
-        decay: of the weight of known depths at this step.
+        decay: of the weight of depth priors at this step.
 
     Returns:
         Losses by name, and errors without gradients, 0 for keypoint rays.
@@ -156,11 +156,11 @@ def batch_losses(
     }
     if len(keypoints):
         reached = sums.reached[keypoints]
-        total["keypoint_depth"] = weight.keypoint_depth * known_depth(
+        total["keypoint_depth"] = weight.keypoint_depth * depth_priors(
             sums.mass.index_select(0, keypoints), reached, KEYPOINT_OUTLIERS, reached.sum().clamp(min=1)
         )
-    if told.disparities is not None and weight.known_depth > 0:
-        total["known_depth"] = (weight.known_depth * decay) * known_depth(
+    if told.disparities is not None and weight.depth_priors > 0:
+        total["depth_priors"] = (weight.depth_priors * decay) * depth_priors(
             sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers, max(1, len(pixels))
         )
     if rays.lookup is not None and step % TV_EVERY == 0 and field.density.requires_grad:

@@ -6,14 +6,14 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Any
 
 import numpy as np
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
-from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.rendering.metrics import psnr_and_ssim
+from mmpi_ns.rendering.pipeline import MMPIPipeline
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import duration, quoted, say
 
@@ -89,17 +89,17 @@ def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> 
 
 
 @torch.no_grad()
-def quick_test(model: Any, images: InputDataset) -> str:
-    """PSNR and SSIM of a few test images, as a sentence. The model is in training mode afterwards."""
-    model.eval()
-    metrics, scores, began = ImageMetrics("none"), [], monotonic()
-    count = min(VIEWS, len(images))
+def quick_test(pipeline: MMPIPipeline, images: InputDataset) -> str:
+    """PSNR and SSIM of a few test images, as ``ns-eval`` scores them, as a sentence. The pipeline is in training mode
+    afterwards."""
+    pipeline.eval()
+    scores, began, count = [], monotonic(), min(VIEWS, len(images))
     for i in np.linspace(0, len(images) - 1, count).round().astype(int).tolist():
-        predicted = model.get_outputs_for_camera(images.cameras[i : i + 1].to(model.device))["rgb"]
-        scores.append(metrics(predicted, model.observed(images.get_data(i, image_type="float32")).to(predicted)))
+        outputs, observed = pipeline.outputs_of(images.cameras[i : i + 1], images.get_data(i, image_type="float32"))
+        scores.append(psnr_and_ssim(outputs["rgb"], observed))
         if monotonic() - began > LOOK_SECONDS:
             break
-    model.train()
+    pipeline.train()
     psnr, ssim = ([values[name] for values in scores if name in values] for name in ("psnr", "ssim"))
     text = f"PSNR {np.mean(psnr):.2f} dB ({min(psnr):.1f} to {max(psnr):.1f})"
     text += f", SSIM {np.mean(ssim):.3f}" if ssim else ""

@@ -18,9 +18,11 @@ from nerfstudio.utils import comms, writer
 
 from mmpi_ns.data.checks import LOAD_RUNS
 from mmpi_ns.data.datamanager import MMPIDataManager
+from mmpi_ns.data.dataset import image_and_mask
 from mmpi_ns.ops import dispatch
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
+from mmpi_ns.rendering.pipeline import MMPIPipeline
 from mmpi_ns.rendering.rendered import BACKGROUNDS, bounded
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
@@ -49,7 +51,6 @@ from mmpi_ns.utils.host import command, discard, enter_command, signals_go_to, v
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
 from mmpi_ns.utils.random_draws import generator
-from mmpi_priors.new_views import image_and_mask
 
 
 @dataclass
@@ -369,7 +370,7 @@ class MMPITrainer(Trainer):
             if steps := self._last_step + 1 - self._start_step:
                 say(f"Training finished: {steps:,} steps in {duration(monotonic() - self._began)}.")
             if self._says_lines:
-                say(quick_test(self.pipeline.model, self._manager.eval_dataset))
+                say(quick_test(cast(MMPIPipeline, self.pipeline), self._manager.eval_dataset))
         say(next_commands(self.base_dir))
 
     def _write_details(self, step: int) -> None:

@@ -8,7 +8,7 @@ import torch
 from causes import CAUSES, PARTS, borders, markdown, psnr_of, squared, thin, times_seen
 from nerfstudio.cameras.cameras import Cameras
 
-from mmpi_priors.tracks import PosedImages
+from mmpi_ns.data.posed_images import PosedImages
 
 WIDTH, HEIGHT, FOCAL, WALL = 20, 10, 16.0, 4.0
 

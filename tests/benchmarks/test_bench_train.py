@@ -26,7 +26,7 @@ from train_report import headline, markdown
 
 from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.data import datamanager
-from mmpi_priors.known_depth import KnownDepth, packed
+from mmpi_ns.data.priors import DepthPriors, packed
 
 
 def in_this_process(request, threads):
@@ -130,8 +130,8 @@ def test_nerfacto_trains_through_nerfstudios_own_trainer(scene, tmp_path, monkey
 def test_depth_nerfacto_is_given_the_depths_that_ours_finds(scene, tmp_path, monkeypatch):
     maps = [np.full((24, 32, 2), 0.25 + 0.01 * i, np.float32) for i in range(6)]
     maps[0][:12] = 0  # half of an image is not known
-    known = KnownDepth([packed(m) for m in maps])
-    monkeypatch.setattr(datamanager, "know_depths", lambda outputs, tracks, dataset, rays, **how: (known, tracks))
+    known = DepthPriors([packed(m) for m in maps])
+    monkeypatch.setattr(datamanager, "make_depth_priors", lambda outputs, tracks, dataset, rays, **how: (known, tracks))
     for name in ("__init__", "get_metadata"):  # put back afterwards
         monkeypatch.setattr(DepthDataset, name, getattr(DepthDataset, name))
     monkeypatch.setattr(train, "train_apart", in_this_process)

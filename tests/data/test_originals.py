@@ -16,9 +16,9 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from mmpi_ns.data.dataset import LocalOrigin, take_local_origins
+from mmpi_ns.data.copies import fit_cameras, original_of
+from mmpi_ns.data.posed_images import PosedImages, at_full_size
 from mmpi_prepare.export import downscale
-from mmpi_priors.tracks import PosedImages, at_full_size, original_of
 
 
 def write(path: Path, width: int, height: int) -> Path:
@@ -120,7 +120,9 @@ def colmap(folder: Path) -> Callable[[int], DataParserConfig]:
         model.register_frame(model.image(i + 1).frame_id)
     (folder / "sparse/0").mkdir(parents=True)
     model.write(folder / "sparse/0")
-    return lambda factor: ColmapDataParserConfig(data=folder, colmap_path=Path("sparse/0"), downscale_factor=factor)
+    return lambda factor: ColmapDataParserConfig(
+        data=folder, colmap_path=Path("sparse/0"), downscale_factor=factor, load_3D_points=False
+    )
 
 
 @pytest.mark.parametrize("scene", [transforms, colmap])
@@ -133,9 +135,7 @@ def test_cameras_of_copies_look_where_those_of_the_originals_do(tmp_path, size, 
     parser = scene(tmp_path)
 
     def cameras(factor: int) -> Cameras:
-        config = parser(factor)
-        take_local_origins(config)
-        return config.setup().get_dataparser_outputs("train").cameras
+        return fit_cameras(parser(factor).setup().get_dataparser_outputs("train"), factor).cameras
 
     whole, copies = cameras(1), cameras(4)
     assert copies.width[0] == 310 and copies.height[0] == 93
@@ -152,5 +152,4 @@ def test_cameras_of_copies_without_originals_stay(tmp_path):
     file = write(tmp_path / "images_4/x.png", 310, 93)
     camera = Cameras(torch.eye(4)[None, :3], 180.5, 181.5, 152.25, 43.5, 310, 93)
     outputs = DataparserOutputs([file, tmp_path / "images_4/missing.png"], camera)
-    origin = LocalOrigin({"frames": [{"transform_matrix": np.eye(4)}]}, file)
-    assert float(origin.tell(outputs, 4).cameras.fx) == 180.5
+    assert float(fit_cameras(outputs, 4).cameras.fx) == 180.5

@@ -180,7 +180,7 @@ def test_every_kind_of_scene_is_trained_and_evaluated(capture, tmp_path):
     config = trainer_config(data, None, tmp_path, STEPS, training="joint", growth_shares=())
     config.pipeline.datamanager.dataparser = parser
     config.pipeline.datamanager.train_num_rays_per_batch = 256
-    config.pipeline.datamanager.triangulate = False
+    config.pipeline.datamanager.priors.triangulate = False
     trainer = ready(config)
     trainer.train()
     metrics = trainer.pipeline.get_average_eval_image_metrics()

@@ -90,7 +90,7 @@ def test_total_variation_is_added_every_few_steps_while_densities_train(scene, p
     assert "tv" not in run_step(trainer, -(-blend // TV_EVERY) * TV_EVERY)[1]
 
 
-def test_the_densest_planes_decide_how_exact_a_known_depth_can_be(scene, tmp_path, monkeypatch):
+def test_the_densest_planes_decide_how_exact_a_depth_priors_can_be(scene, tmp_path, monkeypatch):
     plan = write_plan(scene, tmp_path / "plan.json", num_mpis=2)
     words = json.loads(plan.read_text())
     words["mpis"][1]["planes"] = 2
@@ -154,12 +154,12 @@ def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path)
         assert all(torch.isfinite(v) for v in losses.values())
 
 
-def test_the_weight_of_known_depths_falls_with_the_rates(scene, plan_file, tmp_path, monkeypatch):
+def test_the_weight_of_depth_priorss_falls_with_the_rates(scene, plan_file, tmp_path, monkeypatch):
     trainer, weights = trainer_of(scene, plan_file, tmp_path, training="joint"), []
     real = mmpi_ns.model.batch_losses
 
     def recorded(*args):
-        weights.append(args[3].known_depth)
+        weights.append(args[3].depth_priors)
         return real(*args)
 
     monkeypatch.setattr(mmpi_ns.model, "batch_losses", recorded)

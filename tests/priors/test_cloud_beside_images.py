@@ -9,8 +9,6 @@ import pytest
 from tiny_scene import wall_points, write_scene
 from training_runs import datamanager
 
-from mmpi_ns.data.datamanager import OBSERVATIONS
-
 
 def scene_with_points(folder, points):
     """The tiny scene without a COLMAP model, and with these points in ``ply_file_path``; None: without any."""
@@ -32,7 +30,7 @@ def without(tmp_path_factory):
 
 
 def codes(manager):
-    return np.stack(manager.known_depth.codes)
+    return np.stack(manager.priors.depths.codes)
 
 
 def test_points_of_a_cloud_are_depths_of_pixels_and_keypoints(without, tmp_path, capsys):
@@ -43,10 +41,10 @@ def test_points_of_a_cloud_are_depths_of_pixels_and_keypoints(without, tmp_path,
     tracked = slice(len(seen.seen_at))
     columns, rows = seen.seen_at.astype(int).T
     distance = np.linalg.norm(seen.points[seen.seen_point[tracked]] - seen.centers[seen.seen_by[tracked]], axis=-1)
-    stored = np.stack([manager.known_depth.image(i) for i in range(6)])[seen.seen_by[tracked], rows, columns, 0]
+    stored = np.stack([manager.priors.depths.image(i) for i in range(6)])[seen.seen_by[tracked], rows, columns, 0]
     assert (np.abs(stored * distance - 1) < 0.05).all()  # two points may share a pixel: the nearer stays
-    assert manager.known_depth.share > without.known_depth.share
-    placed, cells = (m.train_dataset.metadata[OBSERVATIONS] for m in (manager, without))
+    assert manager.priors.depths.share > without.priors.depths.share
+    placed, cells = (m.priors.placement for m in (manager, without))
     assert len(placed.seen_by) > len(cells.seen_by)
 
 
@@ -62,6 +60,6 @@ def test_a_cloud_that_the_images_contradict_changes_nothing(without, tmp_path, c
 def test_a_cloud_gives_depths_where_images_are_not_matched(tmp_path):
     data = scene_with_points(tmp_path / "scene", wall_points())
     manager = datamanager(data, dense_depth=False, depth_images=False)
-    assert manager.known_depth is not None and manager.known_depth.share > 0.03
+    assert manager.priors.depths is not None and manager.priors.depths.share > 0.03
     manager.config.dataparser.load_3D_points = False
-    assert manager.config.setup(device="cpu", test_mode="val").known_depth is None
+    assert manager.config.setup(device="cpu", test_mode="val").priors.depths is None

@@ -11,20 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from mmpi_ns.data.posed_images import PosedImages
+from mmpi_ns.data.priors import UNKNOWN, DepthPriors, packed
 from mmpi_ns.placement.observations import Observations
-from mmpi_priors import known_depth
+from mmpi_priors import depth_priors
 from mmpi_priors.dense import Depth
-from mmpi_priors.known_depth import (
-    POINT_ERROR,
-    SENSOR_ERROR,
-    UNKNOWN,
-    KnownDepth,
-    at_training_pixels,
-    packed,
-    with_points,
-    with_sensor,
-)
-from mmpi_priors.tracks import PosedImages
+from mmpi_priors.depth_priors import POINT_ERROR, SENSOR_ERROR, at_training_pixels, with_points, with_sensor
 from mmpi_priors.views import View
 
 F32 = np.float32
@@ -113,13 +105,13 @@ def test_stored_distances_are_off_by_a_tenth_of_their_least_error_and_0_stays_un
     numbers = (
         np.concatenate([[0.0], 10 ** np.random.default_rng(0).uniform(-9, 9, 9999)]).astype(F32).reshape(50, 100, 2)
     )
-    found = KnownDepth([packed(numbers)]).image(0)
+    found = DepthPriors([packed(numbers)]).image(0)
     assert np.allclose(found, numbers, rtol=STEP, atol=0) and STEP < 0.1 * min(POINT_ERROR, SENSOR_ERROR)
     assert found[0, 0, 0] == 0 and (found.reshape(-1)[1:] > 0).all()
 
 
 def nothing_known():
-    return KnownDepth([np.full((60, 80, 2), UNKNOWN, np.int16)] * 2)
+    return DepthPriors([np.full((60, 80, 2), UNKNOWN, np.int16)] * 2)
 
 
 def seen(points, cameras, at):
@@ -155,7 +147,7 @@ def test_a_depth_image_of_a_sensor_is_along_the_axis_in_its_unit_and_0_is_unknow
     np.save(file, depth) if suffix == "npy" else cv2.imwrite(str(file), depth)
     posed = photographed(tmp_path)
     half = replace(posed, intrinsics=posed.intrinsics / 2, sizes=posed.sizes / 2)
-    found = with_sensor(KnownDepth([packed(np.zeros((30, 40, 2)))]), [file], 0.002, half).image(0)
+    found = with_sensor(DepthPriors([packed(np.zeros((30, 40, 2)))]), [file], 0.002, half).image(0)
     u, v = (5.5 * 2 - 40) / 60, (3.5 * 2 - 30) / 60
     assert found[3, 5] == pytest.approx(np.array([1, SENSOR_ERROR]) / (6 * np.sqrt(u * u + v * v + 1)), rel=STEP)
     assert not found[:, 20:].any()
@@ -165,7 +157,7 @@ def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
     depth = np.zeros((HEIGHT, WIDTH), np.uint16)
     depth[:30] = 2000
     cv2.imwrite(str(tmp_path / "d.png"), depth)
-    before = KnownDepth([packed(np.full((HEIGHT, WIDTH, 2), 0.25))])
+    before = DepthPriors([packed(np.full((HEIGHT, WIDTH, 2), 0.25))])
     found = with_sensor(before, [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
     assert (found[30:] == 0.25).all() and found[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
 
@@ -176,7 +168,7 @@ def test_depth_images_of_images_that_are_reduced_when_they_are_read_show_the_who
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     posed = photographed(tmp_path)
     half = replace(posed, intrinsics=posed.intrinsics / 2, sizes=posed.sizes / 2)
-    nothing = KnownDepth([packed(np.zeros((HEIGHT // 2, WIDTH // 2, 2)))])
+    nothing = DepthPriors([packed(np.zeros((HEIGHT // 2, WIDTH // 2, 2)))])
     distances = 1 / with_sensor(nothing, [tmp_path / "d.png"], 1e-3, half).image(0)[15, :, 0]
     longer = np.sqrt(((np.arange(40) + 0.5 - 20) / 30) ** 2 + (0.5 / 30) ** 2 + 1)
     assert distances[:20] == pytest.approx(2 * longer[:20], rel=1e-3)
@@ -188,13 +180,13 @@ def test_a_sensor_and_matches_that_contradict_each_other_are_both_left_out(tmp_p
     depth[:, 40:] = 0
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     sensor = with_sensor(
-        KnownDepth([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [tmp_path / "d.png"], 1e-3, photographed(tmp_path)
+        DepthPriors([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [tmp_path / "d.png"], 1e-3, photographed(tmp_path)
     ).image(0)
     matched = np.stack([1.8 * sensor[..., 0], np.full((HEIGHT, WIDTH), 0.01, F32)], -1)  # as a mirror shows
     matched[:20, :, 0] = 1.02 * sensor[:20, :, 0]  # within the errors
     matched[:, 40:] = 0.25  # the sensor says nothing
     matched[50:] = 0  # the matches say nothing
-    found = with_sensor(KnownDepth([packed(matched)]), [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
+    found = with_sensor(DepthPriors([packed(matched)]), [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
     assert (found[20:50, :40] == 0).all()
     assert (found[:20, :40] == sensor[:20, :40]).all() and (found[50:, :40] == sensor[50:, :40]).all()
     assert (found[:50, 40:] == 0.25).all() and sensor[0, 0, 0] > 0.3
@@ -206,7 +198,7 @@ def test_a_depth_image_that_cannot_be_read_is_named(tmp_path, content):
     if content is not None:
         file.write_bytes(content)
     with pytest.raises(ValueError, match=r"lost\.png"):
-        with_sensor(KnownDepth([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [file], 1e-3, photographed(tmp_path)).image(0)
+        with_sensor(DepthPriors([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [file], 1e-3, photographed(tmp_path)).image(0)
 
 
 def test_the_observations_need_no_points():
@@ -227,8 +219,8 @@ def test_threads_read_cached_depths_one_at_a_time(monkeypatch):
             return super().__getitem__(name)
 
     codes = packed(np.full((HEIGHT, WIDTH, 2), 0.25))
-    monkeypatch.setattr(known_depth, "remembered", lambda *_: Arrays({f"{i}": codes for i in range(20)}))
-    known = known_depth._from_cache("", list)
+    monkeypatch.setattr(depth_priors, "remembered", lambda *_: Arrays({f"{i}": codes for i in range(20)}))
+    known = depth_priors._from_cache("", list)
     with ThreadPoolExecutor(8) as pool:
         images = list(pool.map(known.image, range(20)))
     assert len(images) == 20 and (images[0] == 0.25).all()

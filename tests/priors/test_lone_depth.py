@@ -12,10 +12,11 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.ray_generators import RayGenerator
 
-from mmpi_priors import known_depth
-from mmpi_priors.known_depth import KnownDepth, packed, with_continued
+from mmpi_ns.data.posed_images import PosedImages
+from mmpi_ns.data.priors import DepthPriors, packed
+from mmpi_priors import depth_priors
+from mmpi_priors.depth_priors import with_continued
 from mmpi_priors.lone_depth import LEAST_ERROR, MOST_ERROR, continued, is_lone
-from mmpi_priors.tracks import PosedImages
 
 F32 = np.float32
 WIDTH, HEIGHT, FOCAL = 96, 64, 60.0
@@ -137,7 +138,7 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, mo
     Also where every second or third pixel is looked at; then a pixel at the border of what others show may go either
     way.
     """
-    monkeypatch.setattr(known_depth, "CONTINUED", most)
+    monkeypatch.setattr(depth_priors, "CONTINUED", most)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     stops = [0.0, 4.0, *[4.0] * between]
     images, d = posed(*[(0, 0, -z) for z in stops]), directions()
@@ -148,12 +149,12 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, mo
     usable = np.ones((HEIGHT, WIDTH), bool)
     dataset: Any = SimpleNamespace(has_masks=False, usable=lambda i: usable)
     rays = RayGenerator(cameras)
-    found = with_continued(KnownDepth(list(map(packed, known))), images, dataset, rays)
-    again = with_continued(KnownDepth(list(map(packed, known))), images, dataset, rays)
+    found = with_continued(DepthPriors(list(map(packed, known))), images, dataset, rays)
+    again = with_continued(DepthPriors(list(map(packed, known))), images, dataset, rays)
     assert all(np.array_equal(a, b) for a, b in zip(found.codes, again.codes, strict=True))
     usable[:3] = False
     dataset.has_masks = True
-    masked = with_continued(KnownDepth(list(map(packed, known))), images, dataset, rays).image(0)
+    masked = with_continued(DepthPriors(list(map(packed, known))), images, dataset, rays).image(0)
     assert not masked[:3].any() and np.count_nonzero(masked) > 0.8 * np.count_nonzero(found.image(0)[3:])
     first, exact = found.image(0), plane((0, 0, -1), 10, d)
     points = d / exact[..., None]
@@ -165,4 +166,4 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, mo
     else:
         assert added[~middle()].mean() > 0.8
     assert first[added][:, 0] == pytest.approx(exact[added], rel=0.02)
-    assert np.array_equal(first[middle()], KnownDepth(list(map(packed, known))).image(0)[middle()])
+    assert np.array_equal(first[middle()], DepthPriors(list(map(packed, known))).image(0)[middle()])

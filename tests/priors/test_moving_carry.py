@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_priors import moving, moving_carry, moving_objects
 from mmpi_priors.dense import Depth
 from mmpi_priors.moving import reaches_side
 from mmpi_priors.moving_carry import Carried, carried, whole_objects
 from mmpi_priors.moving_evidence import Neighbour, Shot
 from mmpi_priors.moving_objects import followed
-from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import View
 
 SIZE, FOCAL, HEIGHT = (160, 240), 200.0, 1.5
@@ -218,7 +218,7 @@ def test_only_images_that_were_looked_at_again_get_another_outline(monkeypatch):
     masks = [np.full((2, 2), i < 4) for i in range(5)]
     unused: Any = None
     evidence: Any = SimpleNamespace(noise=2.5)
-    looks = {i: moving._Look([], unused, unused, unused, evidence, np.eye(2) > i) for i in (1, 3, 4)}
+    looks = {i: moving._Look([], unused, unused, evidence, np.eye(2) > i) for i in (1, 3, 4)}
     near = [[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]]
     shots: Any = range(5)
     asked = []

@@ -13,6 +13,7 @@ import pytest
 from training_runs import datamanager
 
 from mmpi_ns.data.datamanager import load_observations
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_priors import moving
 from mmpi_priors.dense import Depth
 from mmpi_priors.moving import gain_of, in_image
@@ -28,7 +29,6 @@ from mmpi_priors.moving_objects import (
     seeds,
     unexplained,
 )
-from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import Parallax, View, camera_matrix
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
@@ -91,7 +91,7 @@ def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):
     masked = [~manager.train_dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy() for i in range(8)]
     assert sum(mask.sum() for mask in masked) > 1000
     for i, mask in enumerate(masked):
-        assert not manager.known_depth.image(i)[mask].any()
+        assert not manager.depth_priors.image(i)[mask].any()
     for step in range(20):
         image, row, column = manager.next_train(step)[1]["indices"].T.tolist()
         assert not any(masked[i][r, c] for i, r, c in zip(image, row, column, strict=True))
@@ -101,7 +101,7 @@ def test_masks_of_the_user_win_and_the_option_leaves_all_pixels(drive, manager):
     assert manager.train_dataset.has_masks and not manager.eval_dataset.has_masks
     kept = datamanager(drive, mask_moving=False)
     assert not kept.train_dataset.has_masks
-    assert kept.known_depth.share > manager.known_depth.share
+    assert kept.depth_priors.share > manager.depth_priors.share
 
 
 def test_masks_of_some_frames_win_and_what_moves_in_the_others_is_masked(drive, manager, tmp_path):

@@ -10,10 +10,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from tiny_scene import FOCAL, HEIGHT, TRAIN, WALL, WIDTH, color_of, image_of, on_wall, pixel_rays, pose_of
 
+from mmpi_ns.data.posed_images import PosedImages
+from mmpi_ns.data.priors import DepthPriors, packed
 from mmpi_priors import new_views
-from mmpi_priors.known_depth import KnownDepth, packed
 from mmpi_priors.new_views import find_shared_points
-from mmpi_priors.tracks import PosedImages
 from mmpi_priors.views import project
 
 POSES = np.stack([pose_of(i)[:3] for i in TRAIN])
@@ -44,7 +44,7 @@ def exact_depths(error=0.01):
         directions = pixel_rays() @ pose[:, :3].T
         inverse = 1 / true_distance(np.broadcast_to(pose[:, 3], directions.shape), directions)
         maps.append(np.stack([inverse, error * inverse], -1).reshape(HEIGHT, WIDTH, 2).astype(np.float32))
-    return KnownDepth([packed(m) for m in maps])
+    return DepthPriors([packed(m) for m in maps])
 
 
 class Images:
@@ -121,14 +121,14 @@ def test_points_come_from_the_nearest_images():
 
 def test_a_depth_that_the_other_image_contradicts_is_no_point():
     known = exact_depths()
-    wrong = KnownDepth([packed(known.image(0) * np.float32([1.1, 1])), *known.codes[1:]])
+    wrong = DepthPriors([packed(known.image(0) * np.float32([1.1, 1])), *known.codes[1:]])
     points = find(wrong)
     assert not (points.pixels[:, 0] == 0).any() and not (points.other == 0).any() and len(points.other) > 100
 
 
 def test_an_uncertain_or_unknown_depth_is_no_point():
     assert find(exact_depths(0.05)) is None
-    assert find(KnownDepth([packed(np.zeros_like(exact_depths().image(i))) for i in range(6)])) is None
+    assert find(DepthPriors([packed(np.zeros_like(exact_depths().image(i))) for i in range(6)])) is None
     assert find(images=[2]) is None, "one image has nobody to share with"
 
 

@@ -14,20 +14,19 @@ from PIL import Image
 from tiny_scene import write_colmap
 
 from mmpi_ns.data.checks import say_once
+from mmpi_ns.data.posed_images import PosedImages, posed_images
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors import observe as mmpi_observations
 from mmpi_priors.observe import (
     ENOUGH_KEYPOINTS,
     drop_masked,
     observe,
-    posed_images,
     read_observations,
     tell_poses,
     with_surfaces,
     with_tracks,
 )
 from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
-from mmpi_priors.tracks import PosedImages
 
 SIZES = np.array([[40.0, 20.0], [80.0, 60.0]])
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mmpi_ns.data.priors import Gains
 from mmpi_priors import photometry
-from mmpi_priors.photometry import ColorRatios, ExposedView, Gains, grouped, image_gains, solve
+from mmpi_priors.photometry import ColorRatios, ExposedView, grouped, image_gains, solve
 
 CONSTANT, FLAT = np.zeros((12, 3)), np.zeros((2, 3))
 

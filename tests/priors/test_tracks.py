@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 from value_noise import noise
 
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors import tracks as triangulation
 from mmpi_priors.observe import with_tracks
-from mmpi_priors.tracks import EFFORTS, NEIGHBOURS, PosedImages, near_pairs, triangulate
+from mmpi_priors.tracks import EFFORTS, NEIGHBOURS, near_pairs, triangulate
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 180.0
 LENS = (0.05, -0.02, 0.001, -0.002)

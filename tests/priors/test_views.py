@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_tracks import HEIGHT, LENS, POSES, WIDTH, scene_of
 
-from mmpi_priors.tracks import PosedImages
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_priors.views import Parallax, View, load_view
 
 

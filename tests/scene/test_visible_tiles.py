@@ -9,7 +9,7 @@ from hand_made import make_mpi, rotation
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from training_runs import datamanager, plan_of
 
-from mmpi_ns.data.datamanager import TRAINING_VIEWS
+from mmpi_ns.data.datamanager import CAPTURE
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.scene import visible_tiles
 from mmpi_ns.scene.geometry import Frames, plane_hits, sample_disparity
@@ -150,7 +150,7 @@ def test_a_camera_that_sees_half_the_world_reaches_every_plane_before_it(kind):
 
 def test_the_data_manager_hands_the_training_images_to_the_model(scene):
     manager = datamanager(scene)
-    views = manager.train_dataset.metadata[TRAINING_VIEWS]
+    views = manager.train_dataset.metadata[CAPTURE].views
     plan = plan_of(manager.observations)
     assert len(views.origins) == len(manager.train_dataset)
     bundle = manager.next_train(0)[0]  # pixels and keypoints

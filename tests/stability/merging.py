@@ -177,7 +177,7 @@ def _keypoint(precision: Precision) -> Outcome:
 
     def keypoint(v: torch.Tensor) -> torch.Tensor:
         _, mass, reached = depth_sums.reference(v, *there)
-        return losses.known_depth(mass, reached, losses.KEYPOINT_OUTLIERS, reached.sum().clamp(min=1))
+        return losses.depth_priors(mass, reached, losses.KEYPOINT_OUTLIERS, reached.sum().clamp(min=1))
 
     return _loss(precision, keypoint, w, wanted, 60.0, 16)
 

@@ -37,14 +37,14 @@ def distortion(weights, positions, intervals):
 def keypoint_depth(weights, inverse_t, known, valid, relative_width=losses.KEYPOINT_WIDTH):
     targets = torch.cat([known, (relative_width * known).clamp(min=1e-12)], -1)
     sums = depth_sums(weights, inverse_t, valid, torch.ones_like(known[:, 0]), targets, 1.0)
-    return losses.known_depth(sums.mass, sums.reached, losses.KEYPOINT_OUTLIERS, sums.reached.sum().clamp(min=1))
+    return losses.depth_priors(sums.mass, sums.reached, losses.KEYPOINT_OUTLIERS, sums.reached.sum().clamp(min=1))
 
 
-def known_depth(weights, inverse_t, known, valid, least_error, outliers=0.02):
+def depth_priors(weights, inverse_t, known, valid, least_error, outliers=0.02):
     error = (known[:, 1:] ** 2 + least_error**2).sqrt().clamp(min=1e-12)
     targets = torch.cat([known[:, :1], error], -1)
     sums = depth_sums(weights, inverse_t, valid, torch.ones_like(known[:, 0]), targets, 1.0)
-    return losses.known_depth(sums.mass, sums.reached, outliers, max(1, len(sums.mass)))
+    return losses.depth_priors(sums.mass, sums.reached, outliers, max(1, len(sums.mass)))
 
 
 def test_photometric_is_the_mean_squared_error():
@@ -217,12 +217,12 @@ def test_gradients_are_finite_for_empty_and_opaque_rays():
     assert torch.isfinite(weights.grad).all() and torch.isfinite(transmittance.grad).all()
 
 
-def test_known_depth_by_hand():
+def test_depth_priors_by_hand():
     # Known at 1/t = 2 with an error of 0.06, planes at least 0.08 uncertain: 0.1 in all; samples at 2, 1, 0 of it, far.
     weights, inverse_t = tensor([[0.1, 0.4, 0.2, 0.3]]), tensor([[2.2, 2.1, 2.0, 0.5]])
     valid = torch.ones(1, 4, dtype=torch.bool)
     mass = 0.1 * math.exp(-2) + 0.4 * math.exp(-0.5) + 0.2
-    loss = known_depth(weights, inverse_t, tensor([[2.0, 0.06]]), valid, least_error=0.08, outliers=0.05)
+    loss = depth_priors(weights, inverse_t, tensor([[2.0, 0.06]]), valid, least_error=0.08, outliers=0.05)
     assert loss.item() == pytest.approx(-math.log(mass + 0.05), abs=1e-9)
 
 
@@ -230,17 +230,17 @@ def test_a_depth_is_believed_as_its_error_says():
     """The same miss costs a certain depth more than an uncertain one, and planes too coarse to show it cost nothing."""
     weights, inverse_t, valid = tensor([[1.0]]), tensor([[1.1]]), torch.ones(1, 1, dtype=torch.bool)
     cost = [
-        known_depth(weights, inverse_t, tensor([[1.0, e]]), valid, least, 0.02).item()
+        depth_priors(weights, inverse_t, tensor([[1.0, e]]), valid, least, 0.02).item()
         for e, least in ((0.05, 0.0), (0.2, 0.0), (0.05, 0.2))
     ]
     assert cost[0] > cost[1] > cost[2] and cost[2] == pytest.approx(0.1, abs=0.05)
 
 
-def test_rays_without_a_known_depth_or_out_of_its_reach_cost_nothing_and_count():
+def test_rays_without_a_depth_priors_or_out_of_its_reach_cost_nothing_and_count():
     weights, inverse_t = torch.full((4, 2), 0.5, dtype=F64), tensor([[1.0, 0.0]] * 4)
     valid = torch.tensor([[True, True], [True, True], [False, True], [True, True]])
     known = tensor([[1.0, 0.01], [3.0, 0.01], [1.0, 0.01], [0.0, 0.0]])  # reached, too near, empty slot, not known
-    loss = known_depth(weights, inverse_t, known, valid, 0.0, 0.02)
+    loss = depth_priors(weights, inverse_t, known, valid, 0.0, 0.02)
     assert loss.item() == pytest.approx(-math.log(0.5 + 0.02) / 4)
 
 
@@ -250,7 +250,7 @@ def test_a_false_depth_pulls_no_harder_than_the_share_of_outliers_allows():
     valid, known = torch.ones(1, 2, dtype=torch.bool), tensor([[1.0, 0.01]])
     pulls = []
     for outliers in (1e-4, 0.02, 0.2):
-        (pull,) = torch.autograd.grad(known_depth(weights, tensor([[2.0, 1.0]]), known, valid, 0.0, outliers), weights)
+        (pull,) = torch.autograd.grad(depth_priors(weights, tensor([[2.0, 1.0]]), known, valid, 0.0, outliers), weights)
         pulls.append(-pull[0, 1].item())
     assert pulls == pytest.approx([1e4, 50, 5], rel=1e-4)
 
@@ -264,7 +264,7 @@ def test_many_right_depths_outweigh_a_tenth_of_false_ones():
     for _ in range(300):
         optimizer.zero_grad()
         weights = torch.softmax(logits, -1).expand(100, -1)
-        known_depth(
+        depth_priors(
             weights, inverse_t.expand(100, -1), known, torch.ones(100, 20, dtype=torch.bool), 0.05, 0.2
         ).backward()
         optimizer.step()
@@ -274,23 +274,23 @@ def test_many_right_depths_outweigh_a_tenth_of_false_ones():
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e5])
-def test_known_depth_does_not_depend_on_the_scene_scale(scale):
+def test_depth_priors_does_not_depend_on_the_scene_scale(scale):
     weights, inverse_t, known = tensor([[0.2, 0.5, 0.3]]), tensor([[1.1, 1.0, 0.9]]), tensor([[1.02, 0.03]])
     valid = torch.ones(1, 3, dtype=torch.bool)
-    loss = known_depth(weights, inverse_t, known, valid, 0.05)
-    scaled = known_depth(weights, inverse_t / scale, known / scale, valid, 0.05 / scale)
+    loss = depth_priors(weights, inverse_t, known, valid, 0.05)
+    scaled = depth_priors(weights, inverse_t / scale, known / scale, valid, 0.05 / scale)
     assert loss.item() == pytest.approx(scaled.item()) and loss.item() > 0.1
 
 
-def test_known_depth_has_the_gradient_of_finite_differences_and_a_finite_one_without_mass():
+def test_depth_priors_has_the_gradient_of_finite_differences_and_a_finite_one_without_mass():
     rng = np.random.default_rng(6)
     weights = tensor(rng.random((3, 5)) + 0.05).requires_grad_()
     valid, known = torch.ones(3, 5, dtype=torch.bool), tensor([[1.0, 0.1], [1.2, 0.2], [0.0, 0.0]])
     inverse_t = tensor(1 + rng.random((3, 5)) * 0.2)
-    assert torch.autograd.gradcheck(lambda w: known_depth(w, inverse_t, known, valid, 0.05), (weights,))
+    assert torch.autograd.gradcheck(lambda w: depth_priors(w, inverse_t, known, valid, 0.05), (weights,))
     empty = torch.zeros(2, 3, requires_grad=True)
     bare = torch.tensor([[1e-20, 0.0], [5.0, 0.0]])
-    known_depth(
+    depth_priors(
         empty, torch.tensor([[1e30, 0.0, 1e-20], [5.0, 5.0, 0.0]]), bare, torch.ones(2, 3, dtype=torch.bool), 0.0
     ).backward()
     assert empty.grad is not None and torch.isfinite(empty.grad).all()

@@ -4,7 +4,7 @@ const float TURN = 0.01;        // angle of viewing directions below which weigh
 const float FADE = 0.2;         // angle at which half of a difference is left, radians
 const float SAME_DEPTH = 0.05;  // relative difference of inverse depths within which two images show one surface
 const float SAME_PIXELS = 0.5;  // ... or displacement by their difference, pixels
-const float STRENGTH = 0.9;     // share of a difference that is shown: the rest does not recur in other views
+const float STRENGTH = 1.2;     // a field fits its training images better than others, which lack more
 const float LEAST_WEIGHT = 0.1; // total weight of training images below which details fade
 const float TINY = 1e-9;
 

@@ -5,9 +5,8 @@ Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM po
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from threading import Lock
 from typing import cast
@@ -15,14 +14,15 @@ from typing import cast
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int16
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from rich.progress import track
-from torch import Tensor
 
+from mmpi_ns.data.copies import shown_size, size_of
 from mmpi_ns.data.dataset import MMPIDataset, read_depth_image
+from mmpi_ns.data.posed_images import PosedImages, at_full_size, posed_images
+from mmpi_ns.data.priors import UNKNOWN, Codes, DepthPriors, packed, unpacked
 from mmpi_ns.data.rays import Rays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import duration, say
@@ -31,11 +31,8 @@ from mmpi_ns.utils.parallel import in_order, num_threads
 from mmpi_priors.cache import Computed, digest, remembered
 from mmpi_priors.dense import SEARCH_SECONDS, SECONDS, Depth, find_depths
 from mmpi_priors.lone_depth import continued, is_lone
-from mmpi_priors.observe import POINT_ERROR, contradict, drop_masked, posed_images, see_points
-from mmpi_priors.tracks import PosedImages, at_full_size, shown_size, size_of
-from mmpi_priors.views import STRIP, Map, View, look_up, straightened, strips
-
-Codes = NDArray[np.int16]
+from mmpi_priors.observe import POINT_ERROR, contradict, drop_masked, see_points
+from mmpi_priors.views import Map, View, look_up, straightened, strips
 
 VERSION = 17
 """Version of the algorithm: cached depths of another version are recomputed."""
@@ -52,54 +49,11 @@ CELLS = 32
 """Cells along the longer side of an image; placement gets one depth from each."""
 SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
-UNKNOWN, OCTAVE = -(2**15), 1024
-"""Code of a number that is 0, and codes in an octave."""
 MOST_KEYPOINTS = 3.0
 """Multiple of the cells with a depth above which placement leaves keypoints out."""
 
 
-@dataclass(frozen=True)
-class KnownDepth:
-    """For every training image: inverse distance from the camera, 0 where unknown, and its expected error.
-
-    Stored in 16 bits each; the relative rounding error of a distance is at most 0.034 %.
-    """
-
-    codes: Sequence[Codes]
-    """[H, W, 2] each, by ``packed``; mapped from a file or computed when read, so that they take no memory."""
-
-    def image(self, i: int) -> Map:
-        """The numbers of one image. [H, W, 2]"""
-        return unpacked(torch.from_numpy(np.require(self.codes[i], requirements="W"))).numpy()
-
-    @cached_property
-    def share(self) -> float:
-        """Share of all pixels whose distance is known."""
-        count = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
-        return count / max(1, sum(m[..., 0].size for m in self.codes))
-
-
-def packed(values: ArrayLike) -> Codes:
-    """Logarithms of positive numbers in steps of 1/1024 of an octave, for 1/t and errors from 2^-31 to 2^31; 0 is kept.
-
-    Steps are relative, as the error of a distance is.
-    """
-    values = np.asarray(values, np.float32)
-    codes, flat = np.empty(values.shape, np.int16), values.reshape(-1)
-    for first in range(0, flat.size, STRIP):
-        part = flat[first : first + STRIP]
-        logarithms = np.log2(np.where(part > 0, part, 1))
-        coded = np.where(part > 0, np.rint(OCTAVE * logarithms.clip(-31, 31)), UNKNOWN)
-        codes.reshape(-1)[first : first + STRIP] = coded
-    return codes
-
-
-def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
-    """The inverse of ``packed``."""
-    return torch.exp2(codes.float() / OCTAVE).masked_fill_(codes == UNKNOWN, 0.0)
-
-
-def know_depths(
+def make_depth_priors(
     outputs: DataparserOutputs,
     observations: Observations,
     dataset: MMPIDataset,
@@ -107,7 +61,7 @@ def know_depths(
     *,
     dense: bool,
     sensor: bool,
-) -> tuple[KnownDepth | None, Observations]:
+) -> tuple[DepthPriors | None, Observations]:
     """All available depths of the training images, and the observations with the points of a cloud, if there is one.
 
     ``dense`` matches neighbouring images, ``sensor`` reads depth images; without both and a cloud the depths are None.
@@ -116,7 +70,7 @@ def know_depths(
     if not (dense or sensor or observations.loose is not None):
         return None, observations
     unknown = (np.broadcast_to(np.int16(UNKNOWN), (int(h), int(w), 2)) for w, h in observations.sizes)  # of no memory
-    depths, posed = KnownDepth(tuple(unknown)), posed_images(observations, dataset)
+    depths, posed = DepthPriors(tuple(unknown)), posed_images(observations, dataset)
     files = outputs.metadata.get("depth_filenames") if sensor else None
     if posed is None or not (dense or files or observations.loose is not None):
         return depths, observations
@@ -141,7 +95,7 @@ def know_depths(
     return depths, seen
 
 
-def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
+def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> DepthPriors:
     """Depths by dense matching, from the cache if possible."""
     seen_by, points = observations.tracked
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
@@ -166,7 +120,7 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     return _from_cache(digest(original.files, "depths", VERSION, side, shapes, *cameras, seen_by, points), match)
 
 
-def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
+def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> DepthPriors:
     """The codes of all images in turn, from the cache if the key is there."""
     arrays = remembered(key, lambda: ((f"{i}", codes) for i, codes in enumerate(find())))
     # One at a time: numpy parses the header of an array with ast, which fails at times in threads of CPython 3.11.
@@ -176,10 +130,10 @@ def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
         with reading:
             return cast(Codes, arrays[f"{i}"])
 
-    return KnownDepth(Computed(len(arrays), read))
+    return DepthPriors(Computed(len(arrays), read))
 
 
-def with_sensor(depths: KnownDepth, files: list[Path], unit: float, posed: PosedImages) -> KnownDepth:
+def with_sensor(depths: DepthPriors, files: list[Path], unit: float, posed: PosedImages) -> DepthPriors:
     """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept.
 
     ``files`` are the depth images of all training images, and ``unit`` is the length of a depth of 1, scene units.
@@ -200,7 +154,7 @@ def with_sensor(depths: KnownDepth, files: list[Path], unit: float, posed: Posed
         codes[apart] = UNKNOWN
         return codes
 
-    return KnownDepth(Computed(len(files), replaced))
+    return DepthPriors(Computed(len(files), replaced))
 
 
 def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, shape: tuple[int, int]) -> Map:
@@ -232,7 +186,7 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
     return distances
 
 
-def with_continued(depths: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
+def with_continued(depths: DepthPriors, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> DepthPriors:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
     Masked pixels have no distance: what moves is nowhere.
@@ -266,7 +220,7 @@ def with_continued(depths: KnownDepth, posed: PosedImages, dataset: MMPIDataset,
     return _from_cache(key, lambda: track(in_order(codes_of, range(count)), work, count, console=CONSOLE))
 
 
-def of_cells(observations: Observations, depths: KnownDepth, dataset: MMPIDataset) -> Observations:
+def of_cells(observations: Observations, depths: DepthPriors, dataset: MMPIDataset) -> Observations:
     """The observations that placement weighs: of each image cell the pixel with the most certain depth.
 
     Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then draw MPIs and texels
@@ -309,7 +263,7 @@ def of_cells(observations: Observations, depths: KnownDepth, dataset: MMPIDatase
     )
 
 
-def with_points(depths: KnownDepth, observations: Observations) -> KnownDepth:
+def with_points(depths: DepthPriors, observations: Observations) -> DepthPriors:
     """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
     cameras, points = observations.tracked
     distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
@@ -324,4 +278,4 @@ def with_points(depths: KnownDepth, observations: Observations) -> KnownDepth:
         codes[rows[chosen], columns[chosen]] = inverse[chosen]
         return codes
 
-    return KnownDepth(Computed(len(depths.codes), added))
+    return DepthPriors(Computed(len(depths.codes), added))

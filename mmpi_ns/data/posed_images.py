@@ -1,0 +1,64 @@
+"""Images with their cameras and lenses, as whatever compares images needs them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from numpy.typing import NDArray
+
+from mmpi_ns.data.copies import shown_size, size_of, whole_of
+from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.placement.observations import Observations
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """Images and their cameras."""
+
+    files: tuple[Path, ...]
+    camera_to_worlds: NDArray[np.float64]
+    """[M, 3, 4], OpenGL axes."""
+    intrinsics: NDArray[np.float64]
+    """[M, 4]: fx, fy, cx, cy in pixels."""
+    sizes: NDArray[np.float64]
+    """[M, 2]: width, height in pixels."""
+    distortion: NDArray[np.float64]
+    """[M, 4]: k1, k2, p1, p2 (OpenCV), or k1 to k4 of a fisheye lens."""
+    fisheye: NDArray[np.bool_] | bool = False
+    """Whether the lens of each image is a fisheye: [M], or one for all."""
+
+    def is_fisheye(self, i: int) -> bool:
+        """Whether image i has a fisheye lens."""
+        return bool(np.broadcast_to(self.fisheye, len(self.sizes))[i])
+
+    def is_bent(self, i: int) -> bool:
+        """True if the lens of image i is not a pinhole's; a fisheye never is, even if all its terms are 0."""
+        return self.is_fisheye(i) or bool(self.distortion[i].any())
+
+
+def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImages | None:
+    """The training images with their cameras and lenses; None where a camera is neither perspective nor fisheye."""
+    kinds = dataset.cameras.camera_type.reshape(-1).cpu()
+    is_fisheye = kinds == CameraType.FISHEYE.value
+    if not (is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all():
+        return None
+    lens = dataset.cameras.distortion_params  # k1, k2, k3, k4, p1, p2
+    lens = torch.zeros(len(dataset), 6) if lens is None else lens.reshape(len(dataset), 6).cpu()
+    lens = torch.where(is_fisheye[:, None], lens[:, :4], lens[:, [0, 1, 4, 5]])
+    files = tuple(map(Path, dataset.image_filenames))
+    cameras = observations.camera_to_worlds, observations.intrinsics, observations.sizes
+    return PosedImages(files, *cameras, distortion=lens.double().numpy(), fisheye=is_fisheye.numpy())
+
+
+def at_full_size(images: PosedImages) -> PosedImages:
+    """The same views in their originals, which are sharper; a view whose original has another shape stays as it is.
+    Raises InputError naming an image file that cannot be read."""
+    copies = [size_of(file) for file in images.files]
+    files, sizes, scales = zip(*map(whole_of, images.files, copies), strict=True)
+    reduced = np.stack(copies) / [shown_size(*pair) for pair in zip(copies, images.sizes, strict=True)]
+    intrinsics = images.intrinsics * np.tile(scales * reduced, 2)
+    return replace(images, files=files, sizes=np.stack(sizes), intrinsics=intrinsics)

@@ -1,0 +1,226 @@
+"""What the images of a capture tell beside their colours: a record that training, placement and evaluation read.
+
+``mmpi_priors`` makes it; a training without priors has an empty one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Int16, UInt8
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.configs.base_config import InstantiateConfig
+from numpy import ndarray
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from mmpi_ns.data.rays import Rays
+from mmpi_ns.placement.observations import Observations
+
+Codes = NDArray[np.int16]
+UNKNOWN, OCTAVE = -(2**15), 1024
+"""Code of a number that is 0, and codes in an octave."""
+STRIP = 1 << 16
+"""Numbers that are coded at once."""
+AGREEMENT = 0.8
+"""Gains are used if they lower the median error of pairs that were left out to less than this fraction,"""
+SPAN, SPAN_ERRORS = 0.03, 6.0
+"""and if 80 % of the log gains span at least this, and this many of their errors."""
+MOST_HEADROOM = 0.5
+"""Smallest factor of the field's reference exposure."""
+
+
+@dataclass
+class PriorsConfig(InstantiateConfig):
+    """Which priors are made of a capture: ``--pipeline.datamanager.priors.*``."""
+
+    _target: Any = "mmpi_priors.maker:PriorsMaker"
+    """Module and class, imported when a capture is read."""
+    sfm_path: Path = Path("colmap/sparse/0")
+    """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
+    triangulate: bool = True
+    """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
+    dense_depth: bool = True
+    """Match the originals of neighbouring training images densely at the start, for the depth of most pixels (about a
+    second for a million pixels on one core, on all cores; kept in ~/.cache/mmpi_ns for the next start)."""
+    depth_images: bool = True
+    """Use the depth images that a data parser lists (depth_file_path)."""
+    mask_moving: bool = True
+    """Mask what moves (cars, people) in the training images that have no mask: its pixels are not trained on."""
+    correct_exposure: bool = True
+    """Calibrate exposure and white balance of the images, by surfaces that several show and by EXIF, and compare each
+    image with the scene at its own exposure, if that explains how images differ."""
+
+    def setup(self, **kwargs: Any) -> Any:
+        """The maker of priors."""
+        module, name = self._target.split(":")
+        return getattr(import_module(module), name)(self, **kwargs)
+
+
+@dataclass(frozen=True)
+class DepthPriors:
+    """For every training image: inverse distance from the camera, 0 where unknown, and its expected error.
+
+    Stored in 16 bits each; the relative rounding error of a distance is at most 0.034 %.
+    """
+
+    codes: Sequence[Codes]
+    """[H, W, 2] each, by ``packed``; mapped from a file or computed when read, so that they take no memory."""
+
+    def image(self, i: int) -> NDArray[np.float32]:
+        """The numbers of one image. [H, W, 2]"""
+        return unpacked(torch.from_numpy(np.require(self.codes[i], requirements="W"))).numpy()
+
+    @cached_property
+    def share(self) -> float:
+        """Share of all pixels whose distance is known."""
+        count = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
+        return count / max(1, sum(m[..., 0].size for m in self.codes))
+
+
+def packed(values: ArrayLike) -> Codes:
+    """Logarithms of positive numbers in steps of 1/1024 of an octave, for 1/t and errors from 2^-31 to 2^31; 0 is kept.
+
+    Steps are relative, as the error of a distance is.
+    """
+    values = np.asarray(values, np.float32)
+    codes, flat = np.empty(values.shape, np.int16), values.reshape(-1)
+    for first in range(0, flat.size, STRIP):
+        part = flat[first : first + STRIP]
+        logarithms = np.log2(np.where(part > 0, part, 1))
+        coded = np.where(part > 0, np.rint(OCTAVE * logarithms.clip(-31, 31)), UNKNOWN)
+        codes.reshape(-1)[first : first + STRIP] = coded
+    return codes
+
+
+def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
+    """The inverse of ``packed``."""
+    return torch.exp2(codes.float() / OCTAVE).masked_fill_(codes == UNKNOWN, 0.0)
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Factors between the colours of images and of a reference exposure."""
+
+    factors: Float[ndarray, "N 3"]
+    """Colour in the image over colour at the reference exposure, each channel's geometric mean 1."""
+    errors: Float[ndarray, "N"]
+    """Expected errors of their logarithms."""
+    falloff: Float[ndarray, "2 3"]
+    """Log colour per r^2 and r^4, towards the corners."""
+    disagreement: float
+    """Median difference of log colours in pairs of images that were left out, without gains,"""
+    corrected: float
+    """and with them."""
+
+    @property
+    def span(self) -> float:
+        """Ratio of green factors that 80 % of the images lie between."""
+        low, high = np.quantile(self.factors[:, 1], [0.1, 0.9])
+        return float(high / low)
+
+    def describe(self) -> str:
+        """Whether and how much exposure varies, in one sentence."""
+        before, after, error = (100 * x for x in (self.disagreement, self.corrected, float(np.median(self.errors))))
+        if not self.matter and self.confirmed and np.log(self.span) > SPAN:
+            return (
+                f"Exposure is not corrected: where images show the same, colours differ by {before:.1f} %, but too few "
+                f"surfaces are shared to tell by how much exposures do (expected error {error:.1f} %)."
+            )
+        if not self.matter:
+            return f"Exposure: equal to within {before:.1f} % where images show the same."
+        return (
+            f"Exposure varies {self.span:.2f}-fold between images and is corrected: where two show the same, colours "
+            f"that differed by {before:.1f} % differ by {after:.1f} %."
+        )
+
+    @property
+    def from_field(self) -> Float[ndarray, "N 3"]:
+        """Factors from the colours of a field, which are at most 1, to those of the images: the field is as dark as the
+        darkest image, or half as bright as the reference, so that it holds what only dark images do not clip."""
+        return self.factors / np.clip(self.factors.min(), MOST_HEADROOM, 1)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether pairs that were left out agree better with the gains than without."""
+        return self.corrected < AGREEMENT * self.disagreement
+
+    @property
+    def matter(self) -> bool:
+        """Whether images differ by more than errors explain, and the gains are confirmed."""
+        return bool(self.confirmed and np.log(self.span) > max(SPAN, SPAN_ERRORS * float(np.median(self.errors))))
+
+
+@dataclass(frozen=True)
+class SharedPoints:
+    """Points that two training images show at the same depth, each as a pixel of the first."""
+
+    pixels: Int[Tensor, "P 3"]
+    """Image, row and column in the first."""
+    other: Int[Tensor, "P"]
+    """The second image."""
+    colors: UInt8[Tensor, "P 2 C"]
+    """Colour in the first and the second image."""
+    depths: Float[Tensor, "P 2"]
+    """Inverse distance from the first camera, and its expected error."""
+    centers: Float[Tensor, "M 3"]
+    """Positions of all training cameras."""
+    cover: float
+    """Number of points divided by the number of pixels; limits how often each point is drawn."""
+
+    def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
+        """The points shared by two of the given images; None if there is none."""
+        images, names = images.to(self.pixels), ("pixels", "other", "colors", "depths")
+        shared = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
+        return replace(self, **{name: getattr(self, name)[shared] for name in names}) if len(shared) else None
+
+    def draw(
+        self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
+    ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
+        """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
+
+        Colours are divided by the ``exposures`` of all training images; None: they are equal.
+        """
+        device = self.pixels.device
+        chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
+        share = torch.rand(count, 1, generator=g, device=g.device).to(device)
+        first = rays(self.pixels[chosen].long())
+        depths, colors = self.depths[chosen], self.colors[chosen].float() / 255
+        if exposures is not None:
+            images = torch.stack([self.pixels[chosen, 0], self.other[chosen]], -1).long()
+            colors[..., :3] /= exposures[images]
+        origins = torch.lerp(first.origins, self.centers[self.other[chosen].long()], share)
+        # Relative to the first camera, so that the direction of distant points stays exact.
+        offsets = (first.origins - origins) * depths[:, :1] + first.directions
+        length = offsets.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        bundle = RayBundle(origins, offsets / length, torch.ones_like(share), camera_indices=first.camera_indices)
+        # The error of a distance along the ray is about that from the first camera.
+        return bundle, torch.lerp(colors[:, 0], colors[:, 1], share), depths / torch.cat([length, length**2], -1)
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What M training images tell beside their colours."""
+
+    observations: Observations
+    """Cameras, SfM points and who saw them."""
+    placement: Observations
+    """The same with one depth of each image cell: what placement weighs."""
+    depths: DepthPriors | None = None
+    """Depth and expected error of pixels; None if nobody looked."""
+    masks: Sequence[NDArray[np.bool_]] | None = None
+    """What moves in each image [H, W]; None if nothing does."""
+    movers: str = ""
+    """How much of the images moves, in a sentence; empty if nobody looked."""
+    gains: Gains | None = None
+    """Exposures of the images; None if they are equal."""
+    new_views: Callable[..., tuple[SharedPoints | None, str]] | None = None
+    """Points that two of some images see at the same depth, and the reason where there are none, for images, a device
+    and exposures; None if nobody looked."""

@@ -1,0 +1,140 @@
+"""All priors of a capture by one call: what ``ns-train`` and ``mmpi-plan`` know of the images beside their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from torch import Tensor
+
+from mmpi_ns.data.dataset import MMPIDataset, image_and_mask
+from mmpi_ns.data.exif import light_of
+from mmpi_ns.data.posed_images import at_full_size, posed_images
+from mmpi_ns.data.priors import DepthPriors, Gains, Priors, PriorsConfig, SharedPoints
+from mmpi_ns.data.rays import Rays
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.utils.errors import InputError, say
+from mmpi_priors.depth_priors import make_depth_priors, of_cells
+from mmpi_priors.moving import moving_masks, share_of_moving
+from mmpi_priors.new_views import find_shared_points
+from mmpi_priors.observe import drop_masked, observe
+from mmpi_priors.photometry import SAME_LIGHT, color_ratios, exposure_of_image, image_gains
+
+
+class PriorsMaker:
+    """Makes the priors of a capture as its settings ask.
+
+    Args:
+        config: which priors.
+        outputs: of the data parser, for the training images.
+        dataset: the training images. Its ``moving`` masks are set by ``make``.
+        parser: settings of the data parser.
+        rays: makes rays through pixels of the training images.
+        seed: of all random draws.
+    """
+
+    def __init__(
+        self,
+        config: PriorsConfig,
+        outputs: DataparserOutputs,
+        dataset: MMPIDataset,
+        parser: DataParserConfig,
+        rays: Rays,
+        seed: int,
+    ) -> None:
+        self.config, self.outputs, self.dataset, self.parser = config, outputs, dataset, parser
+        self.rays, self.seed = rays, seed
+
+    def observe(self, find_points: bool) -> Observations:
+        """Training cameras and SfM points. Without ``find_points`` images, which may be absent, are not searched."""
+        return observe(
+            self.outputs, self.dataset, self.parser, self.config.sfm_path,
+            find_points=find_points, triangulates=self.config.triangulate,
+        )  # fmt: skip
+
+    def make(self) -> Priors:
+        """All priors. Raises InputError naming an image, mask or depth image that cannot be used."""
+        config, dataset, observations, movers = self.config, self.dataset, self.observe(find_points=True), ""
+        if config.mask_moving and None in dataset.mask_files:
+            # A mask file of the user wins over what is seen to move.
+            masks, doubt = moving_masks(observations, dataset)
+            masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
+            movers, is_masked = share_of_moving(masks), any(mask.any() for mask in masks)
+            say(movers + (" (--pipeline.datamanager.priors.mask-moving False keeps them)." if is_masked else "."))
+            if doubt:
+                say(doubt, "yellow")
+            if is_masked:
+                dataset.moving = masks
+                observations = drop_masked(observations, dataset)
+        depths, observations = make_depth_priors(
+            self.outputs, observations, dataset, self.rays, dense=config.dense_depth, sensor=config.depth_images
+        )
+        placement = observations if depths is None else of_cells(observations, depths, dataset)
+        gains = self._gains(observations, depths) if config.correct_exposure else None
+        priors = Priors(observations, placement, depths, dataset.moving, movers, gains)
+        return Priors(**{**vars(priors), "new_views": lambda *chosen: self._new_views(priors, *chosen)})
+
+    def _gains(self, observations: Observations, depths: DepthPriors | None) -> Gains | None:
+        """Exposures of the training images, where they differ."""
+        posed = posed_images(observations, self.dataset)
+        if depths is None or posed is None or len(posed.files) < 2:
+            return None
+        light = np.array([light_of(file) for file in at_full_size(posed).files])
+        if np.isfinite(light).all() and np.ptp(np.log(light)) < SAME_LIGHT:
+            say("Exposure: EXIF notes the same for all images.")
+            return None
+        ratios = color_ratios(posed, depths, self.rays, lambda i: image_and_mask(self.dataset, i), self.seed)
+        if ratios is None:
+            return None
+        gains = image_gains(ratios, len(posed.files), light)
+        say(gains.describe())
+        return gains if gains.matter else None
+
+    def _new_views(
+        self,
+        priors: Priors,
+        images: Sequence[int],
+        device: str | torch.device,
+        exposures: Float[Tensor, "M 3"] | None,
+    ) -> tuple[SharedPoints | None, str]:
+        """Points that two of the images, by number, see at one depth; and why there are none."""
+        if priors.depths is None or priors.depths.share == 0:
+            return None, "no pixel has a known depth"
+        posed = posed_images(priors.observations, self.dataset)
+        if posed is None:
+            return None, "a camera is neither perspective nor fisheye"
+        chosen = images, self.seed, device, exposures
+        found = find_shared_points(self.dataset, posed, priors.depths, self.rays, *chosen)
+        return found, "" if found is not None else "no two images show a point at the same depth"
+
+    def exposure_of(
+        self,
+        observations: Observations,
+        factors: Float[Tensor, "M 3"],
+        falloff: Float[Tensor, "2 3"],
+        camera: Cameras,
+        observed: Float[Tensor, "H W 3"],
+        outputs: dict[str, Tensor],
+    ) -> Float[Tensor, "3"] | None:
+        """Exposure of an evaluated image, by surfaces that training images near it show too; None if they show nothing,
+        or are gone.
+
+        Args:
+            observations: of the training cameras.
+            factors: exposures of the training images.
+            falloff: of colours towards the corners.
+            camera: of the evaluated image.
+            observed: its colours.
+            outputs: its rendering, for the depths.
+        """
+        posed = posed_images(observations, self.dataset)
+        if posed is None:
+            return None
+        try:
+            return exposure_of_image(posed, self.dataset, factors, falloff, camera, observed, outputs)
+        except (InputError, OSError):  # the training images are gone
+            return None
