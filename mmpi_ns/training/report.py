@@ -71,8 +71,7 @@ class TrainingLog:
 
 
 def forecast(steps: int, rays: int, threads: int, cores: float) -> str:
-    """Training time of ``steps`` of ``rays`` each on this machine's CPU, and a warning if ``threads`` outnumber the free
-    ``cores``."""
+    """Training time of steps of so many rays on this machine's CPU, and a warning if threads outnumber free cores."""
     together = max(1.0, min(threads, cores))
     seconds = steps * rays / CPU_RAYS * (ONE_THREAD + (1 - ONE_THREAD) / together)
     work = f"{steps:,} steps of {rays:,} rays"

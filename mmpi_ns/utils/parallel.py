@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
+from threading import Lock
 from typing import TypeVar
 
 import cv2
@@ -17,26 +17,33 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-@cache
+_outer: list[int] = []
+"""Threads of torch before each ``torch_apart`` that is entered; a viewer's thread renders beside the training's."""
+_entering = Lock()
+
+
 def num_threads() -> int:
-    """Threads that share the work of this package: as many as torch used when this was first asked for."""
-    return torch.get_num_threads()
+    """Threads that share the work of this package: as many as torch uses, or used before ``torch_apart``."""
+    return _outer[0] if _outer else torch.get_num_threads()
 
 
 @contextmanager
 def torch_apart() -> Iterator[None]:
-    """Within the block torch's own operations take one thread.
+    """Within the block torch's own operations take one thread, and ``num_threads`` stays what it was.
 
     OpenMP's threads wait for torch's next operation spinning, for milliseconds, on the cores that the compiled kernels
     of this package would use. The arrays of a training step and of a picture are too small for torch's threads to pay.
     """
-    num_threads()  # of before
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with _entering:
+        _outer.append(num_threads())
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        with _entering:
+            threads = _outer.pop()
+            if not _outer:
+                torch.set_num_threads(threads)
 
 
 @contextmanager
