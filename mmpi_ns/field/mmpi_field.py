@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from mmpi_ns.blending import log_shares
 from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
 from mmpi_ns.field.tables import Lookup, TexelTables
-from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
 from mmpi_ns.ops.dispatch import on_gpu
 from mmpi_ns.ops.gather import RaySums, Taps, gather_places, gather_taps
