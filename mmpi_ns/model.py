@@ -179,7 +179,6 @@ class MMPIModel(Model):
             factor=schedule.texel_factor(0),
             views=views,
             **asdict(self.config.colour),
-            samples_per_voxel=self.config.sampling.samples_per_voxel,
             cube_alpha=self.config.sampling.cube_alpha,
         )
 

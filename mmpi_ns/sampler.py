@@ -43,8 +43,6 @@ class SamplingConfig:
 
     threshold: float = 3e-3
     """Samples of less weight get no gradient (at most a tenth of an equal share while the resolution grows)."""
-    samples_per_voxel: float = 1.0
-    """Samples per voxel side along a ray through the cube."""
     cube_alpha: float = 1e-3
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
 

@@ -119,6 +119,12 @@ def test_importing_the_package_imports_nothing_large():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_importing_the_methods_reads_no_library_that_only_priors_or_scores_need():
+    """Every ns-* command imports them. OpenCV is among nerfstudio's own imports."""
+    code = "import sys, mmpi_ns.config; assert not {'scipy.signal', 'pycolmap', 'mmpi_priors'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 BESIDE = {path.stem: path for folder in ("benchmarks", "examples") for path in (ROOT.parent / folder).glob("*.py")}
 
 
