@@ -13,6 +13,8 @@ from mmpi_ns.data.rays import CameraRays
 from mmpi_ns.training.step_graph import MEASURED, StepGraphs
 
 STEPS = 20
+MOST_NODES = 560
+"""Kernels of a recorded half of a step at most: 13 heads' worth of networks would be more."""
 
 
 def trained(scene, plan_file, folder, training, shading, records, **settings):
@@ -34,7 +36,8 @@ def trained(scene, plan_file, folder, training, shading, records, **settings):
             for each in optimizer.state.values():
                 yield each["moments"]
 
-    graphs = StepGraphs(model, manager, optimizers, lambda: TapeRecorder(state))
+    recorder = TapeRecorder(state)
+    graphs = StepGraphs(model, manager, optimizers, lambda: recorder)
     if not records:
         graphs._measured = -(10**9)
         graphs._forget = lambda: None
@@ -45,7 +48,9 @@ def trained(scene, plan_file, folder, training, shading, records, **settings):
         total, losses, metrics = graphs.step(step)
         trainer.optimizers.scheduler_step_all(step)
         said.append([total, *losses.values(), *metrics.values()])
-        print(step, graphs.capacity, graphs.repeated, graphs.lost, float(total), flush=True)
+    print(training, shading, "nodes of the recorded halves of steps:", [tape.nodes for tape in recorder.tapes])
+    assert not any(tape.waits for tape in recorder.tapes)
+    assert all(tape.nodes <= MOST_NODES for tape in recorder.tapes)
     return graphs, said, [p.data.clone() for p in model.field.parameters()]
 
 
