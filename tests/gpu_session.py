@@ -61,7 +61,7 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     return [
         Part("device", ["nvidia-smi"], 20),
         Part("environment", [*python, "-c", look], 90),
-        Part("quick", [*bench, "gpu", "--quick", "--folder", str(work / "quick")], 120),
+        Part("quick", [*bench, "gpu", "--folder", str(work / "quick")], 120),
         Part("tests", [*python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", "tests/ops"], 120),
         Part("costs", [*steps, "costs", "--out", str(out / "costs.json")], 40),
         *(
