@@ -195,18 +195,6 @@ def _uses(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
-def _votes(device: str, shapes: Shapes) -> list[tuple]:
-    cases = []
-    for mpis in shapes.mpis:
-        layout, tables = _scene(device, shapes.cube, mpis)
-        ahead = torch.cat([_random(device, RAYS, 2) - 0.5, torch.ones(RAYS, 1, device=device)], -1)
-        directions = torch.nn.functional.normalize(ahead, dim=-1)
-        rays, heads = ((_random(device, ROWS, n)[:, 0] * n).long() for n in (RAYS, layout.num_heads))
-        samples = (rays, _random(device, ROWS), heads)
-        cases.append((layout, tables.touched, _random(device, RAYS, 3) * 0.4 - 0.2, directions, *samples))
-    return cases
-
-
 CHANGED = {"adam_rows": (0, 1), "note_use": (5,)}
 """Arguments that an operation changes."""
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
@@ -215,7 +203,6 @@ CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "adam_rows": _updates,
     "texel_rows": _texels,
     "note_use": _uses,
-    "voting_texels": _votes,
     "march": _marches,
     "total_variation": _variations,
     "gather_taps": _gathers,

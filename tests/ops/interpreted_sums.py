@@ -6,10 +6,8 @@ import pytest
 import torch
 from bricked import bricked_field
 from interpreting import interpreted, normal  # noqa: F401
-from kernel_cases import _scene
 
 from mmpi_ns.ops.adam import AdamConstants, adam_rows
-from mmpi_ns.ops.blending import voting_texels
 from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.ops.depth_sums import depth_sums
 from mmpi_ns.ops.gather import Taps
@@ -102,20 +100,3 @@ def test_texels_of_samples_are_those_of_the_reference():
     rows, weights = texel_rows(field.layout, heads, planes, ndc)
     wanted = texel_rows.reference(field.layout, heads, planes, ndc)
     assert torch.equal(rows, wanted[0]) and torch.allclose(weights, wanted[1], atol=2e-6)
-
-
-def test_texels_that_vote_are_those_of_the_reference():
-    layout, tables = _scene("cpu", with_cube=True, count=3)
-    g, count = torch.Generator().manual_seed(1), 900
-    origins = torch.rand(40, 3, generator=g) * 0.4 - 0.2
-    ahead = torch.cat([torch.rand(40, 2, generator=g) - 0.5, torch.ones(40, 1)], -1)
-    directions, rays = torch.nn.functional.normalize(ahead, dim=-1), torch.randint(0, 40, (count,), generator=g)
-    inverse_t, heads = torch.rand(count, generator=g), torch.randint(0, 4, (count,), generator=g)
-    inverse_t[::50] = 0  # at infinity
-    given = (layout, tables.touched, origins, directions, rays, inverse_t, heads)
-    found, wanted = voting_texels(*given), voting_texels.reference(*given)
-    same = found.cover == wanted.cover
-    assert same.float().mean() > 0.998 and 0.2 < found.cover.float().mean() < 0.9
-    values = torch.rand(len(tables.density), generator=g)
-    read = [(values[v.rows] * v.weights * (v.rows > 0)).sum(-1)[same & wanted.cover] for v in (found, wanted)]
-    assert torch.allclose(*read, atol=1e-5) and read[0].abs().max() > 0.5
