@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.data.dataset import MMPIDataset, image_and_mask
@@ -61,7 +62,7 @@ class PriorsMaker:
         config, dataset, observations, movers = self.config, self.dataset, self.observe(find_points=True), ""
         if config.mask_moving and None in dataset.mask_files:
             # A mask file of the user wins over what is seen to move.
-            masks, doubt = moving_masks(observations, dataset)
+            masks, doubt = self._moving(observations)
             masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
             movers, is_masked = share_of_moving(masks), any(mask.any() for mask in masks)
             say(movers + (" (--pipeline.datamanager.priors.mask-moving False keeps them)." if is_masked else "."))
@@ -77,6 +78,14 @@ class PriorsMaker:
         gains = self._gains(observations, depths) if config.correct_exposure else None
         priors = Priors(observations, placement, depths, dataset.moving, movers, gains)
         return Priors(**{**vars(priors), "new_views": lambda *chosen: self._new_views(priors, *chosen)})
+
+    def _moving(self, observations: Observations) -> tuple[Sequence[NDArray[np.bool_]], str]:
+        """What moves in each image, and why that is doubtful; nothing where lenses cannot be undone."""
+        shapes = [(int(h), int(w)) for w, h in observations.sizes]
+        posed = posed_images(observations, self.dataset)
+        if posed is None:
+            return [np.zeros(shape, bool) for shape in shapes], ""
+        return moving_masks(at_full_size(posed), shapes, *observations.tracked)
 
     def _gains(self, observations: Observations, depths: DepthPriors | None) -> Gains | None:
         """Exposures of the training images, where they differ."""

@@ -30,7 +30,7 @@ from mmpi_ns.data.rays import lens_directions
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, quoted
-from mmpi_priors.cache import Arrays, digest, remembered
+from mmpi_priors.cache import Arrays, kept
 from mmpi_priors.patches import search_surfaces
 from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
 from mmpi_priors.tracks import SAME_PLACE, triangulate
@@ -42,8 +42,6 @@ MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
 POSES_OFF = 0.5
 """Error of the poses, in training pixels, above which it is reported."""
-TRACKS_VERSION = 3
-"""Version of the algorithm: cached tracks of another version are recomputed."""
 ENOUGH_KEYPOINTS = 20
 """Average number of keypoints in an image above which no surfaces need to be searched."""
 SEARCHED, SEARCHED_SIDE = 16, 220
@@ -118,8 +116,7 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
             CONSOLE.print(f"No SfM tracks: matching the features of {size}.")
             return {name: np.asarray(value) for name, value in vars(triangulate(originals)).items()}
 
-        cameras = originals.camera_to_worlds, originals.intrinsics, originals.distortion, originals.fisheye
-        stored: Mapping[str, Any] = remembered(digest(originals.files, "tracks", TRACKS_VERSION, *cameras), find)
+        stored: Mapping[str, Any] = kept("tracks", originals, (), find)
         model = SfmModel(**{**stored, "off": stored["off"].item()})
         CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
         observations = with_tracks(observations, model)
