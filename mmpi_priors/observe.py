@@ -25,11 +25,10 @@ from scipy.ndimage import minimum_filter
 
 from mmpi_ns.data.checks import say_once
 from mmpi_ns.data.dataset import MMPIDataset
-from mmpi_ns.data.posed_images import PosedImages, at_full_size, posed_images
-from mmpi_ns.data.rays import lens_directions
+from mmpi_ns.data.posed_images import PosedImages, at_full_size, camera_observations, posed_images
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
-from mmpi_ns.utils.errors import InputError, quoted
+from mmpi_ns.utils.errors import quoted
 from mmpi_priors.cache import Arrays, kept
 from mmpi_priors.patches import search_surfaces
 from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
@@ -215,21 +214,9 @@ def read_observations(
 ) -> Observations:
     """Training cameras as they are used, with the SfM points and keypoints moved into their frame, and the points of a
     cloud [P, 3]. Raises InputError naming the image whose pose or intrinsics cannot be used."""
-    poses = np.array(cameras.camera_to_worlds.double().cpu())
-    flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
-    usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)
-    if not usable.all():
-        raise InputError(
-            f"The camera of {outputs.image_filenames[usable.argmin()]} has a pose or focal length that is no finite "
-            "number or not positive: correct it or remove the frame."
-        )
-    # The axes of an MPI come from a camera and must be orthonormal to more digits than poses in captures are.
-    left, _, right = np.linalg.svd(poses[:, :, :3])
-    poses[:, :, :3] = left @ right
-    sizes = torch.cat([cameras.width, cameras.height], -1).double().cpu().numpy()
-    loose = None if cloud is None else usable_points(cloud, poses[:, :, 3])
-    loose = loose if loose is not None and len(loose) else None
-    observations = Observations(poses, np.stack(flat, -1), sizes, lens=lens_directions(cameras), loose=loose)
+    observations = camera_observations(cameras, outputs.image_filenames)
+    if cloud is not None and len(loose := usable_points(cloud, observations.centers)):
+        observations = replace(observations, loose=loose)
     if sfm is None:
         return observations
     transform = outputs.dataparser_transform.double().numpy()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -102,25 +101,6 @@ def test_masks_of_the_user_win_and_the_option_leaves_all_pixels(drive, manager):
     kept = datamanager(drive, mask_moving=False)
     assert not kept.train_dataset.has_masks
     assert kept.priors.depths.share > manager.priors.depths.share
-
-
-def test_masks_of_some_frames_win_and_what_moves_in_the_others_is_masked(drive, manager, tmp_path):
-    meta = json.loads((drive / "transforms.json").read_text())
-    moving = [mask.any() for mask in manager.train_dataset.moving]
-    number = moving.index(True)
-    name = manager.train_dataset.image_filenames[number].name
-    frame = next(frame for frame in meta["frames"] if frame["file_path"].endswith(name))
-    frame["mask_path"] = "by-hand.png"
-    cv2.imwrite(str(tmp_path / "by-hand.png"), np.full((180, 320), 255, np.uint8))
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    for entry in drive.iterdir():
-        if entry.name != "transforms.json":
-            (tmp_path / entry.name).symlink_to(entry)
-    partly = datamanager(tmp_path)
-    assert partly.train_dataset.get_data(number, "uint8")["mask"].all()
-    assert "in 7 of 8 images" in partly.priors.movers or not all(moving)
-    for i in set(range(8)) - {number}:
-        np.testing.assert_array_equal(partly.train_dataset.moving[i], manager.train_dataset.moving[i])
 
 
 def test_what_moves_is_told_and_drawn(manager, tmp_path):
