@@ -22,7 +22,7 @@ from mmpi_ns.data.datamanager import CAPTURE, Capture
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.ops.march import Capacity, MarchOptions
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
@@ -51,7 +51,7 @@ from mmpi_ns.training.phases import TRAINS, ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
-from mmpi_ns.utils.random_draws import generator
+from mmpi_ns.utils.random_draws import Generators
 
 
 @dataclass
@@ -116,7 +116,7 @@ class MMPIModel(Model):
             joint, placement = self._is_joint(windows), config.placement
             work = Work(
                 config.colour.feature_channels, not joint, capture.rays_per_step, config.sampling.threshold,
-                all_mpis=not joint and config.schedule.rays_per_mpi == "all",
+                all_mpis=not joint and config.schedule.rays_per_mpi == "all", sample_bytes=config.colour.sample_bytes,
             )  # fmt: skip
             fixed = config.plan_file is not None or placement.arrangement != "automatic"
             again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))
@@ -131,6 +131,12 @@ class MMPIModel(Model):
         self.exposures = Exposures(None if capture is None else capture.gains)
         self.details: Details | None = None
         self.metrics = ImageMetrics(config.lpips_net)
+        self.draws = Generators(config.seed, device)
+        self.capacity: Capacity | None = None
+        """Of a training batch on a GPU; None: as many samples as there are."""
+        self.register_buffer("decay", torch.tensor(1.0), persistent=False)
+        """``Schedule.decay`` of the step."""
+        self.decay: Tensor
         self.show = ViewerDropdown("Show MPI", "all", ["all"], hint="One MPI alone, or all")
         self._take_plan()
         dispatch.choose(config.ops)
@@ -203,7 +209,7 @@ class MMPIModel(Model):
         if phase == "individual" and num_mpis > 1:
             # Rays for one of the MPIs that they meet, or for every MPI in turn, and for the cube (paper sec. III-C).
             if self.config.schedule.rays_per_mpi == "split":
-                g = generator(self.config.seed, progress.step, "assignment", self.device)
+                g = self.draws.of(progress.step, "assignment")
                 choose = torch.rand(asked, num_mpis, generator=g, device=self.device)
             else:
                 heads = torch.arange(num_mpis, device=self.device).repeat_interleave(asked)
@@ -212,6 +218,7 @@ class MMPIModel(Model):
                 bundle = bundle.broadcast_to((num_mpis, asked)).flatten()
         blends = "reliability" in TRAINS[phase] and self.blends(field)
         options = self.config.sampling.options(field.plan, not progress.schedule.sharpened(progress.step), blends)
+        options = options._replace(capacity=self.capacity)
         rays = render_rays(bundle, field, options, head_mask, choose)
         return {"training": replace(rays, times=len(bundle) // asked)}
 
@@ -328,9 +335,11 @@ class MMPIModel(Model):
         if "training" not in outputs:  # an evaluation batch during training
             return {"rgb_loss": photometric(outputs["rgb"], self.observed(batch))}
         rays, image, step = outputs["training"], batch["image"].to(self.device), self.progress.step
-        g, weight = generator(self.config.seed, step, "background", self.device), self.config.loss
-        weight = replace(weight, depth_priors=weight.depth_priors * self.progress.schedule.decay(step))
-        total, errors = batch_losses(rays, self.field, image, weight, g, step)
+        g, decay = self.draws.of(step, "background"), self.progress.schedule.decay(step)
+        if not self.draws.recording:
+            self.decay.fill_(decay)
+        held = self.decay if dispatch.on_gpu(self.decay) else decay
+        total, errors = batch_losses(rays, self.field, image, self.config.loss, g, step, held)
         if rays.lookup is not None and self.progress.schedule.watches(step):
             self.field.note_use(rays.lookup, rays.composite.weights, rays.samples.live, errors)
         self.camera_optimizer.get_loss_dict(total)

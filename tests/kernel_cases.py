@@ -10,7 +10,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from mmpi_ns.ops import depth_sums as depth_sums
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops import use as use
+from mmpi_ns.ops import variation as variation
+from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MarchOptions, Rays
@@ -62,6 +66,7 @@ def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:
     with torch.set_grad_enabled(bool(leaves)):
         results = dispatch.function(name, form)(*copies)
     numbers = [*dispatch.tensors_in(vars(results).values() if is_dataclass(results) else [results])]
+    numbers += [copies[i] for i in CHANGED.get(name, ())]
     if leaves:
         loss = sum((x * torch.linspace(-1, 1, x.numel(), device=x.device).view(x.shape)).sum() for x in numbers)
         numbers += list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
@@ -134,7 +139,70 @@ def _gathers(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
+def _rays(device: str, slots: int) -> tuple[Tensor, Tensor]:
+    """Positive numbers in the slots of rays, and which of these hold a sample."""
+    return _random(device, RAYS, slots), torch.arange(slots, device=device) < torch.arange(RAYS, device=device)[:, None]
+
+
+def _composites(device: str, shapes: Shapes) -> list[tuple]:
+    cases = []
+    for slots in (1, 31, 130):
+        tau, valid = _rays(device, slots)
+        before, total = _random(device, RAYS, slots + 1)[:, 1:].contiguous(), _random(device, RAYS, 1)
+        cases.append((tau.requires_grad_(), valid, before, total))
+    return cases
+
+
+def _depths(device: str, shapes: Shapes) -> list[tuple]:
+    cases = []
+    for slots in (1, 31, 130):
+        inverse_t, valid = _rays(device, slots)
+        weights = torch.where(valid, _random(device, RAYS, slots + 1)[:, 1:] / slots, 0.0).requires_grad_()
+        inverse_t = torch.where(valid, inverse_t, 0.0).sort(-1, descending=True).values
+        targets = _random(device, RAYS, 2) + 0.1
+        cases.append((weights, inverse_t, valid, _random(device, RAYS), targets, 0.7))
+    return cases
+
+
+def _updates(device: str, shapes: Shapes) -> list[tuple]:
+    rows = torch.arange(BRICK, BRICK + 2 * ROWS, 2, device=device)
+    cases = []
+    for channels in (1, shapes.channels):
+        table, grad = _random(device, BRICK + 2 * ROWS, channels), _random(device, ROWS, channels) - 0.5
+        moments = _random(device, len(table), 2, channels).bfloat16()
+        cases.append((table, moments, rows, grad, AdamConstants(0.9, 0.99, 0.3, 1e-8, 0.1)))
+    return cases
+
+
+def _texels(device: str, shapes: Shapes) -> list[tuple]:
+    cases = []
+    for mpis in shapes.mpis:
+        layout = _scene(device, shapes.cube, mpis)[0]
+        heads, planes = ((_random(device, ROWS, n)[:, 0] * n).long() for n in (mpis, 6))
+        cases.append((layout, heads, planes, 2 * _random(device, ROWS, 3) - 1))
+    return cases
+
+
+def _uses(device: str, shapes: Shapes) -> list[tuple]:
+    cases = []
+    for gains in (True, False):
+        taps = [Taps((_random(device, RAYS, n) * ROWS).int(), _random(device, RAYS, n)) for n in (4, 8)]
+        slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(2)])
+        peak, gain = 0.1 * _random(device, 9), _random(device, 9) if gains else None
+        rows = 2 * torch.arange(ROWS, device=device)[: 9 * BRICK // 2]
+        taps = [Taps(each.positions.clamp(max=len(rows) - 1), each.weights) for each in taps]
+        cases.append((rows, taps, slots, _random(device, RAYS, 4), _random(device, RAYS), peak, gain))
+    return cases
+
+
+CHANGED = {"adam_rows": (0, 1), "note_use": (5,)}
+"""Arguments that an operation changes."""
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
+    "composite_weights": _composites,
+    "depth_sums": _depths,
+    "adam_rows": _updates,
+    "texel_rows": _texels,
+    "note_use": _uses,
     "march": _marches,
     "total_variation": _variations,
     "gather_taps": _gathers,

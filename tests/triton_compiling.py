@@ -39,6 +39,7 @@ ARCHITECTURES = (75, 80, 86, 89, 90)
 """Turing, Ampere (A100), Ampere (RTX 30), Ada, Hopper."""
 NAMES = {
     torch.float32: "*fp32",
+    torch.bfloat16: "*bf16",
     torch.int16: "*i16",
     torch.int64: "*i64",
     torch.int32: "*i32",

@@ -31,7 +31,7 @@ from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import num_threads
-from mmpi_ns.utils.random_draws import generator
+from mmpi_ns.utils.random_draws import Generators, generator
 from mmpi_ns.utils.values import check_options
 
 Batch = tuple[TrainingRays, dict[str, Any]]
@@ -100,6 +100,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """Share of the pixel rays that a step draws now, with new views in proportion."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
+        self.draws = Generators(config.seed, kwargs.get("device", "cpu"))
         self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
         """Rays of the next step with what they are drawn from, their step and number."""
         parser: Any = config.dataparser
@@ -108,7 +109,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             mode = kwargs.get("test_mode", "val")
             splits = ("train", "val", "test") if mode == "val" else ("train", "test")  # for the evaluation after it too
             check_transforms(parser, Path(config.data or parser.data), splits, opens=mode != "inference")
-            # The point cloud is read with the other priors, in float64. nerfstudio needs open3d for it, and asks on the
+        if isinstance(parser, NerfstudioDataParserConfig | ColmapDataParserConfig):
+            # Points are read with the other priors, in float64. nerfstudio needs open3d for them, and asks on the
             # terminal where a capture names none.
             parser = replace(parser, load_3D_points=False)
         self._parser = replace(config.dataparser, data=Path(config.data or config.dataparser.data))
@@ -293,7 +295,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if self._ahead is not None:
             source, key, future = self._ahead
             batch = future.result() if source is sources and key == (step, pixel_rays) else None
-        batch = batch or draw(generator(seed, step, "pixels", device))
+        batch = batch or draw(self.draws.of(step, "pixels"))
         if num_threads() > 1 and torch.device(device).type == "cpu":
             future = self._thread.submit(draw, generator(seed, step + 1, "pixels", device))
             self._ahead = sources, (step + 1, pixel_rays), future

@@ -19,6 +19,7 @@ from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
 from mmpi_ns.field.tables import Lookup, TexelTables
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
+from mmpi_ns.ops.dispatch import on_gpu
 from mmpi_ns.ops.gather import RaySums, Taps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
@@ -47,6 +48,13 @@ class ColourConfig:
     """Shading of samples: octaves of the positional encoding of NDC positions."""
     direction_frequencies: int = 2
     """Octaves of the positional encoding of directions."""
+
+    @property
+    def sample_bytes(self) -> int:
+        """What the network of one sample holds for its gradients: inputs, layers before and after their activation, and
+        gradients of both. 0 where rays are shaded."""
+        inputs = self.feature_channels + 6 + 6 * (self.position_frequencies + self.direction_frequencies)
+        return 4 * (2 * inputs + 6 * self.hidden_width) if self.shading == "sample" else 0
 
 
 class MMPIField(TexelTables):
@@ -157,7 +165,10 @@ class MMPIField(TexelTables):
         return out.view(lookup.shape), lookup
 
     def _lookup(self, rays: RayBundle, samples: MergedSamples) -> Lookup:
-        index, heads, planes, ndc, counts = order_by_head(samples.places, len(self.grids), samples.head_counts)
+        room = samples.capacity
+        index, heads, planes, ndc, counts = order_by_head(
+            samples.places, len(self.grids), samples.head_counts, room is not None
+        )
         if rays.origins.requires_grad or rays.directions.requires_grad:
             of_rays, inverse_t = index // samples.valid.shape[1], samples.inverse_t.reshape(-1)[index]
             ndc = moving(self.layout, rays.origins, rays.directions, of_rays, heads, planes, inverse_t, ndc)
@@ -167,12 +178,17 @@ class MMPIField(TexelTables):
             parts.append(texel_rows(self.layout, heads[:in_mpis], planes[:in_mpis], ndc[:in_mpis]))
         if in_mpis < len(index):
             parts.append(self.grids[-1].trilinear(ndc[in_mpis:]))
+        if room is not None:  # what no sample fills reads the empty brick
+            filled = samples.valid.reshape(-1)[index].split([len(rows) for rows, _ in parts])
+            empty = torch.arange(len(index), device=index.device).remainder(BRICK).split([len(x) for x in filled])
+            columns = zip(filled, parts, empty, strict=True)
+            parts = [(torch.where(here[:, None], rows, none[:, None]), w) for here, (rows, w), none in columns]
         rows = [rows.reshape(-1) for rows, _ in parts] or [heads]
-        distinct = index_rows(torch.cat(rows), len(self.density))
+        distinct = index_rows(torch.cat(rows), len(self.density), most=None if room is None else room.rows)
         positions = distinct.positions.split([len(r) for r in rows])
         taps = [Taps(p.view(w.shape), w) for p, (_, w) in zip(positions, parts)]  # noqa: B905
         read = (distinct.unique, *(read_rows(table, distinct.unique) for table in (self.density, self.features)))
-        return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read)
+        return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read, distinct=distinct.count)
 
     def get_outputs(  # type: ignore[override]
         self,
@@ -203,7 +219,7 @@ class MMPIField(TexelTables):
         for k, here, part in lookup.by_head(lookup.read(lookup.features)):
             index = lookup.index[here]
             of_samples = (part, lookup.ndc[here], index // lookup.shape[1], index)
-            if chosen is not None and not chosen.is_cuda:  # a GPU would be waited for
+            if chosen is not None and not on_gpu(chosen):  # a GPU would be waited for
                 kept = chosen[of_samples[2]].nonzero()[:, 0]
                 of_samples = tuple(x.index_select(0, kept) for x in of_samples)
             values, ndc, numbers, index = of_samples

@@ -61,6 +61,8 @@ class Lookup:
     """Distinct rows of the tables, rising."""
     density: Float[Tensor, "U 1"]
     features: Float[Tensor, "U C"]
+    distinct: Int[Tensor, ""] | None = None
+    """How many distinct rows there are, where the samples have a capacity."""
 
     def read(self, values: Float[Tensor, "U C"]) -> Float[Tensor, "N C"]:
         """Interpolated values of the samples, from those of the rows."""

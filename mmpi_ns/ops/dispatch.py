@@ -138,6 +138,11 @@ def operation(
     return functools.partial(Operation, compiled=compiled, check=check, in_cpp=in_cpp)
 
 
+def on_gpu(x: Tensor) -> bool:
+    """Whether the kernels of a GPU take a tensor: nothing may be waited for then."""
+    return x.is_cuda or interpreting
+
+
 def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
     for x in values:
         if isinstance(x, Tensor):

@@ -35,7 +35,7 @@ def disagreement(field: MMPIField, bundle: RayBundle, options: MarchOptions) -> 
     compiled, reference = results["auto"], results["torch"]
     wrong = []
     for name, (rows, values) in reference.items():
-        theirs, ours = _on_same_rows((rows, values), compiled[name])
+        theirs, ours = on_same_rows((rows, values), compiled[name])
         difference = float((ours - theirs).norm() / theirs.norm().clamp(min=1e-12))
         if not difference <= CLOSE:  # NaN too
             wrong.append(f"{name} by {difference:.1%}")
@@ -61,7 +61,7 @@ def _values_and_gradients(field: MMPIField, bundle: RayBundle, options: MarchOpt
     return found
 
 
-def _on_same_rows(first: Rows, second: Rows) -> tuple[Tensor, Tensor]:
+def on_same_rows(first: Rows, second: Rows) -> tuple[Tensor, Tensor]:
     """Values of the rows of either, 0 where one has none."""
     rows = torch.cat([first[0], second[0]]).unique()
     parts = []

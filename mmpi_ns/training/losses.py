@@ -110,7 +110,13 @@ def depth_priors(
 
 
 def batch_losses(
-    rays: RenderedRays, field: MMPIField, image: Tensor, weight: LossWeights, g: torch.Generator, step: int
+    rays: RenderedRays,
+    field: MMPIField,
+    image: Tensor,
+    weight: LossWeights,
+    g: torch.Generator,
+    step: int,
+    decay: float | Float[Tensor, ""] = 1.0,
 ) -> tuple[dict[str, Tensor], Float[Tensor, "R"]]:
     """All losses of a training batch, each times its weight; and the squared colour error of each ray.
 
@@ -121,6 +127,7 @@ def batch_losses(
         weight: of each loss.
         g: draws the colours behind the pixels.
         step: of the training.
+        decay: of the weight of depth priors at this step.
 
     Returns:
         Losses by name, and errors without gradients, 0 for keypoint rays.
@@ -153,7 +160,7 @@ def batch_losses(
             sums.mass.index_select(0, keypoints), reached, KEYPOINT_OUTLIERS, reached.sum().clamp(min=1)
         )
     if told.disparities is not None and weight.depth_priors > 0:
-        total["depth_priors"] = weight.depth_priors * depth_priors(
+        total["depth_priors"] = (weight.depth_priors * decay) * depth_priors(
             sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers, max(1, len(pixels))
         )
     if rays.lookup is not None and step % TV_EVERY == 0 and field.density.requires_grad:

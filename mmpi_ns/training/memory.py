@@ -54,6 +54,8 @@ class Work:
     """Weight that a sample must have to be kept once surfaces have formed."""
     all_mpis: bool = False
     """Whether each MPI renders all rays for a while."""
+    sample_bytes: int = 0
+    """Of the network of every sample: what it holds for the gradients of one."""
 
 
 def fit_memory(
@@ -122,6 +124,9 @@ def reserved_bytes(plan: ScenePlan, work: Work, device: str | torch.device) -> i
     row = 4 * COPIES * (1 + work.feature_channels + work.two_phase)
     each = BYTES_PER_SLOT * room + BYTES_PER_PACKED * width
     step = rays * (each + kept * taps * BYTES_PER_TAP) + min(rays * kept * taps, plan.texels) * row
+    # Until surfaces have formed a ray keeps all samples, those of one MPI where each trains alone.
+    samples = max((m.planes for m in plan.mpis), default=0) if work.two_phase else plan.samples_per_ray
+    step += work.sample_bytes * samples * work.pixel_rays * (len(plan.mpis) if work.all_mpis else 1)
     return int((1 + ALLOCATOR_SHARE) * (step + BYTES_IN_ONE_PASS * room * CPU_RAYS)) + ALLOCATOR_BYTES
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from mmpi_ns.ops.adam import AdamConstants, adam, adam_rows
+from mmpi_ns.ops.dispatch import on_gpu
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.scene.bricks import move_bricks
 from mmpi_ns.utils.pages import lazy_zeros
@@ -33,13 +34,24 @@ class TouchedAdam(torch.optim.Optimizer):
 
     def __init__(self, params: Any, lr: float, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-8, **_: Any):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+        self._constants: dict[Parameter, AdamConstants] = {}
+        self._numbers: dict[Parameter, Tensor] = {}
 
-    @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
         assert closure is None, "TouchedAdam takes no closure"
+        self.advance(self.learning())
+        self.apply()
+
+    def learning(self) -> list[Parameter]:
+        """Parameters with a gradient."""
+        return [p for group in self.param_groups for p in group["params"] if p.grad is not None]
+
+    @torch.no_grad()
+    def advance(self, params: list[Parameter]) -> None:
+        """Begins a step of some parameters: counts it, and sets its numbers."""
         for group in self.param_groups:
             for param in group["params"]:
-                if param.grad is None:
+                if not any(param is each for each in params):
                     continue
                 state = self.state[param]
                 if not state:
@@ -49,9 +61,23 @@ class TouchedAdam(torch.optim.Optimizer):
                     dtype, shape = torch.bfloat16 if table else param.dtype, (len(param), 2, *param.shape[1:])
                     state["step"], state["moments"] = 0, lazy_zeros(shape, dtype, param.device)
                 state["step"] += 1
-                old, (beta1, beta2), steps = (param.data, state["moments"]), group["betas"], state["step"]
-                correction, rate = (1 - beta2**steps) ** 0.5, group["lr"] / (1 - beta1**steps)
-                constants = AdamConstants(beta1, beta2, correction, group["eps"], rate)
+                (beta1, beta2), steps = group["betas"], state["step"]
+                numbers = ((1 - beta2**steps) ** 0.5, group["lr"] / (1 - beta1**steps))
+                if on_gpu(param):  # the same tensors in each step
+                    held = self._numbers.setdefault(param, torch.empty(2, device=param.device)).unbind()
+                    for tensor, number in zip(held, numbers, strict=True):
+                        tensor.fill_(number)
+                    numbers = held
+                self._constants[param] = AdamConstants(beta1, beta2, numbers[0], group["eps"], numbers[1])
+
+    @torch.no_grad()
+    def apply(self) -> None:
+        """Changes the parameters with a gradient, whose step has begun."""
+        for group in self.param_groups:
+            for param in group["params"]:
+                if param.grad is None:
+                    continue
+                old, constants = (param.data, self.state[param]["moments"]), self._constants[param]
                 if isinstance(param, Table):
                     assert param.grad_rows is not None
                     param.pending = adam_rows(*old, param.grad_rows, param.grad, constants)

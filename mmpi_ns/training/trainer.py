@@ -44,6 +44,7 @@ from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.options import check_command, check_nothing_left, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import WINDOWS_FOLDER, TrainingRun, WindowShare, cameras_of, views_of
+from mmpi_ns.training.step_graph import StepGraphs
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import command, discard, enter_command, signals_go_to, values_of
@@ -60,6 +61,8 @@ class MMPITrainerConfig(TrainerConfig):
     max_num_iterations: int = 0
     """Steps of the whole run, resumed or not; if a long capture is split into windows, of each window. 0: as many as
     its pixels need (mmpi-small: 2,500 to 12,000; docs/captures.md)."""
+    graphs: bool = True
+    """On a GPU: repeat steps as CUDA graphs, several times faster than one operation at a time (docs/gpu.md)."""
 
     def set_timestamp(self) -> None:
         """The first code of this package that ns-train runs."""
@@ -175,12 +178,28 @@ class MMPITrainer(Trainer):
                     "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face "
                     "as they do (mmpi-plan shows where)."
                 )
+            self._graphs: StepGraphs | None = None
+            if self._repeats():
+                model: Any = self.pipeline.model
+                self._graphs = StepGraphs(model, self._manager, self.optimizers.optimizers)
             self._announce(plan)
             if self._share is not None and len(plan) < self._share.processes:
                 raise InputError(
                     f"The capture has {len(plan)} window(s), too few to share out among {self._share.processes} "
                     "processes: start fewer, or make windows shorter with --pipeline.model.placement.window-length."
                 )
+
+    def _repeats(self) -> bool:
+        """Whether steps can be graphs: on a GPU by its kernels, where nobody asks for more than the method does."""
+        config, field = self.config, self._run.field
+        return (
+            config.graphs
+            and field.density.is_cuda
+            and dispatch.form_of("march", field.density) == "gpu"
+            and not (self._run.poses or self.mixed_precision or self.use_grad_scaler or config.log_gradients)
+            and all(each["optimizer"].max_norm is None for each in self.optimizers.config.values())
+            and all(count == 1 for count in self.gradient_accumulation_steps.values())
+        )
 
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
@@ -310,7 +329,11 @@ class MMPITrainer(Trainer):
                     "yellow",
                 )
                 dispatch.choose("torch")
-        loss, *others = super().train_iteration(step)
+        if self._graphs is None or self._graphs.is_off:
+            loss, *others = super().train_iteration(step)
+        else:
+            loss, *others = self._graphs.step(step)
+            self.optimizers.scheduler_step_all(step)
         self._last_step = step
         if self._log is not None:
             self._log.note(step, others[0]["rgb_loss"])

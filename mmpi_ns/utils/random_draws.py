@@ -3,11 +3,40 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass, field
 
 import torch
 
 
 def generator(seed: int, step: int, purpose: str, device: str | torch.device = "cpu") -> torch.Generator:
     """A generator whose stream depends on the three keys alone."""
+    return torch.Generator(device=device).manual_seed(_key(seed, step, purpose))
+
+
+def _key(seed: int, step: int, purpose: str) -> int:
     digest = hashlib.blake2b(f"{seed}/{step}/{purpose}".encode(), digest_size=8).digest()
-    return torch.Generator(device=device).manual_seed(int.from_bytes(digest, "little") >> 1)
+    return int.from_bytes(digest, "little") >> 1
+
+
+@dataclass(eq=False)
+class Generators:
+    """The streams of ``generator``, from one object for each purpose: what a CUDA graph can draw from again and again.
+
+    A generator that a graph is recorded with is seeded by ``start`` before each step that the graph repeats.
+    """
+
+    seed: int
+    device: str | torch.device
+    held: dict[str, torch.Generator] = field(default_factory=dict)
+    recording: bool = False
+    """Whether steps are recorded, not drawn: nothing is seeded then."""
+
+    def of(self, step: int, purpose: str) -> torch.Generator:
+        """The stream of a step and a purpose, from its start."""
+        g = self.held.setdefault(purpose, torch.Generator(device=self.device))
+        return g if self.recording else g.manual_seed(_key(self.seed, step, purpose))
+
+    def start(self, step: int) -> None:
+        """Starts the streams of a step."""
+        for purpose in self.held:
+            self.of(step, purpose)

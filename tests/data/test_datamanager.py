@@ -103,22 +103,6 @@ def test_masked_pixels_are_never_drawn(tmp_path):
     assert columns.max() == WIDTH / 2 - 1 and columns.min() == 0
 
 
-def test_frames_without_a_mask_beside_some_that_have_one_are_used_as_a_whole(tmp_path):
-    data = write_scene(tmp_path / "partly", masks=True)
-    meta = json.loads((data / "transforms.json").read_text())
-    for i in (*TRAIN[:2], TEST[0]):
-        del meta["frames"][i]["mask_path"]
-    (data / "transforms.json").write_text(json.dumps(meta))
-    manager = datamanager(data)
-    assert [file is None for file in manager.train_dataset.mask_files] == [True] * 2 + [False] * (len(TRAIN) - 2)
-    masks = [manager.train_dataset.get_data(i, "uint8")["mask"][..., 0] for i in range(len(TRAIN))]
-    assert all(mask.all() for mask in masks[:2])
-    assert all(mask[:, : WIDTH // 2].all() and not mask[:, WIDTH // 2 :].any() for mask in masks[2:])
-    assert manager.eval_dataset.get_data(0)["mask"].all()
-    drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(30)])
-    assert drawn[drawn[:, 0] < 2, 2].max() == WIDTH - 1 and drawn[drawn[:, 0] >= 2, 2].max() == WIDTH // 2 - 1
-
-
 def test_masks_that_leave_nothing_are_refused(tmp_path):
     data = write_scene(tmp_path / "black", masks=True)
     for i in range(8):
@@ -166,7 +150,7 @@ def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
 
 
 def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie_in_it(manager, monkeypatch):
-    seen, depths, dataset = manager.observations, manager.depth_priors, manager.train_dataset
+    seen, depths, dataset = manager.observations, manager.priors.depths, manager.train_dataset
     keypoints, cells = len(seen.seen_by), (np.stack(depths.codes)[..., 0] > UNKNOWN).sum()  # a cell is one pixel here
     for most, both in ((keypoints / cells + 0.01, True), (keypoints / cells - 0.01, False)):
         monkeypatch.setattr(depth_priors, "MOST_KEYPOINTS", most)
@@ -175,10 +159,10 @@ def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie
         assert np.array_equal(placed.seen_by[: both * keypoints], seen.seen_by[: both * keypoints])
         assert len(placed.points) == cells + both * len(seen.points)
     monkeypatch.setattr(depth_priors, "CELLS", 4)  # of 8 x 8 pixels
-    placed = depth_priors.of_cells(manager.observations, manager.depth_priors, manager.train_dataset)
+    placed = depth_priors.of_cells(manager.observations, manager.priors.depths, manager.train_dataset)
     expected = []
     for i in range(6):
-        inverse, error = np.moveaxis(manager.depth_priors.image(i), -1, 0)
+        inverse, error = np.moveaxis(manager.priors.depths.image(i), -1, 0)
         for row, column in np.ndindex(3, 4):
             part = slice(8 * row, 8 * row + 8), slice(8 * column, 8 * column + 8)
             known = inverse[part] > 0

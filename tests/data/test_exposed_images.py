@@ -71,7 +71,7 @@ def test_images_of_one_exposure_are_drawn_as_they_are(scene):
 
 
 def test_exposures_that_exif_notes_as_equal_are_not_searched(exposed, monkeypatch, capsys):
-    monkeypatch.setattr("mmpi_ns.data.datamanager.light_of", lambda file: 0.01)
+    monkeypatch.setattr("mmpi_priors.maker.light_of", lambda file: 0.01)
     assert datamanager(exposed).priors.gains is None
     assert "EXIF notes the same" in capsys.readouterr().out
 

@@ -120,7 +120,9 @@ def colmap(folder: Path) -> Callable[[int], DataParserConfig]:
         model.register_frame(model.image(i + 1).frame_id)
     (folder / "sparse/0").mkdir(parents=True)
     model.write(folder / "sparse/0")
-    return lambda factor: ColmapDataParserConfig(data=folder, colmap_path=Path("sparse/0"), downscale_factor=factor)
+    return lambda factor: ColmapDataParserConfig(
+        data=folder, colmap_path=Path("sparse/0"), downscale_factor=factor, load_3D_points=False
+    )
 
 
 @pytest.mark.parametrize("scene", [transforms, colmap])

@@ -23,14 +23,15 @@ class AdamConstants(NamedTuple):
 
     beta1: float
     beta2: float
-    correction: float
-    """Root of the second moment's: sqrt(1 - beta2^step)."""
+    correction: float | Tensor
+    """Root of the second moment's: sqrt(1 - beta2^step). On a GPU a tensor [], like the rate: steps are recorded once
+    and repeated with other numbers."""
     eps: float
-    rate: float
+    rate: float | Tensor
     """With the first moment's correction: lr / (1 - beta1^step)."""
 
 
-@operation()
+@operation("gpu")
 def adam_rows(
     param: Float[Tensor, "T C"],
     moments: Float[Tensor, "T 2 C"],

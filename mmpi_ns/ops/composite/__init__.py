@@ -37,7 +37,7 @@ class Composite:
     """What passes the whole ray."""
 
 
-@operation()
+@operation("gpu")
 def composite_weights(
     tau: Float[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],

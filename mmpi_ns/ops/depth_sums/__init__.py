@@ -28,7 +28,7 @@ class DepthSums(NamedTuple):
     """Whether a sample lies within three widths of the target, and there is one."""
 
 
-@operation()
+@operation("gpu")
 def depth_sums(
     weights: Float[Tensor, "R S"],
     inverse_t: Float[Tensor, "R S"],

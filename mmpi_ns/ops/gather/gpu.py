@@ -98,7 +98,8 @@ def gather_back_kernel(
             at = row[:, None] * channels + column
             if NEEDED:
                 share = tl.load(shares + number * TAPS + tap, inside, 0.0)
-                tl.atomic_add(to_values + at, share[:, None] * down, filled, sem="relaxed")
+                # What adds nothing is left out: all samples that fill up a capacity have the same few texels.
+                tl.atomic_add(to_values + at, share[:, None] * down, filled & (down != 0), sem="relaxed")
             if MOVED:
                 read = tl.load(values + at, filled, 0.0)
                 tl.store(to_shares + number * TAPS + tap, tl.sum(read * down, 1), inside)

@@ -30,6 +30,8 @@ class RowIndex:
     """Rising, except for padding."""
     positions: Int[Tensor, "..."]
     """Of every entry in ``unique``; int32 or int64."""
+    count: Int[Tensor, ""] | None = None
+    """How many distinct rows there are, if there was room for so many alone."""
 
 
 class Table(nn.Parameter):
@@ -92,7 +94,7 @@ class Table(nn.Parameter):
 
 @operation()
 def order_by_head(
-    places: Places, num_heads: int, counts: Sequence[int] | None = None
+    places: Places, num_heads: int, counts: Sequence[int] | None = None, pads: bool = False
 ) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "N"], Float[Tensor, "N 3"], Sequence[int]]:
     """Valid samples of a batch, ordered by head and otherwise by slot.
 
@@ -100,6 +102,8 @@ def order_by_head(
         places: of the samples.
         num_heads: of the scene.
         counts: samples of each head, if known; otherwise this synchronises with a GPU.
+        pads: ``counts`` is the room for samples of each head; what is left of it refers to the last slot of the first
+            ray, which is empty then. Samples beyond are left out.
 
     Returns:
         Flat slots [R, S] of the samples, their heads, planes and NDC, and how many there are of each head.
@@ -110,12 +114,20 @@ def order_by_head(
         slots, counts = torch.cat(parts), [len(p) for p in parts]
     else:
         keys = torch.where(valid, heads, num_heads)
-        slots = torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)]
+        ordered, slots = torch.sort(keys.to(torch.int16), stable=True)
+        if pads:
+            first = torch.searchsorted(ordered, torch.arange(num_heads + 1, device=keys.device, dtype=torch.int16))
+            of_heads = torch.cat([torch.full((n,), k, device=keys.device) for k, n in enumerate(counts)])
+            at = first[of_heads] + torch.cat([torch.arange(n, device=keys.device) for n in counts])
+            last = places.valid.shape[1] - 1
+            slots = torch.where(at < first[of_heads + 1], slots[at.clamp(max=len(slots) - 1)], last)
+            return slots, of_heads, places.planes.reshape(-1)[slots], places.ndc.reshape(-1, 3)[slots], counts
+        slots = slots[: sum(counts)]
     planes, ndc = places.planes.reshape(-1)[slots], places.ndc.reshape(-1, 3)[slots]
     return slots, heads[slots], planes, ndc, counts
 
 
-@operation()
+@operation("gpu")
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
@@ -137,7 +149,7 @@ def texel_rows(
 
 
 @operation()
-def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) -> RowIndex:
+def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False, most: int | None = None) -> RowIndex:
     """Distinct rows of a list, rising.
 
     Args:
@@ -145,9 +157,15 @@ def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) ->
         table_rows: rows of the table.
         pads: row 0, which no entry refers to there, may follow the distinct rows any number of times. A GPU then
             need not be waited for to tell their number.
+        most: room for so many distinct rows alone, padded likewise; entries of further ones refer to the last.
     """
     listed, order = rows.reshape(-1).sort()
     place = torch.diff(listed, prepend=listed[:1]).ne(0).cumsum(0)
+    if most is not None:
+        unique = torch.zeros(most + 1, dtype=listed.dtype, device=listed.device)
+        unique = unique.index_copy(0, place.clamp(max=most), listed)[:most]
+        positions = torch.empty_like(place).index_copy(0, order, place.clamp(max=most - 1))
+        return RowIndex(unique, positions.view(rows.shape), place[-1] + 1)
     count = len(listed) if pads or not len(listed) else int(place[-1]) + 1
     unique = torch.zeros_like(listed).index_copy(0, place, listed)[:count]
     return RowIndex(unique, torch.empty_like(place).index_copy(0, order, place).view(rows.shape))
@@ -240,7 +258,9 @@ class _WeighRows(torch.autograd.Function):
 
 
 @order_by_head.on_cpu
-def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> tuple:
+def order_by_head_on_cpu(
+    places: Places, num_heads: int, counts: Sequence[int] | None = None, pads: bool = False
+) -> tuple:
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
@@ -265,7 +285,7 @@ def texel_rows_on_cpu(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: T
 
 
 @index_rows.on_cpu
-def index_rows_on_cpu(rows: Tensor, table_rows: int, pads: bool = False) -> RowIndex:
+def index_rows_on_cpu(rows: Tensor, table_rows: int, pads: bool = False, most: int | None = None) -> RowIndex:
     count, listed = rows.numel(), rows.long().contiguous()
     words = torch.zeros(-(-table_rows // BRICK), dtype=torch.int64)
     before, positions = torch.empty(len(words), dtype=torch.int32), torch.empty(rows.shape, dtype=torch.int32)

@@ -23,6 +23,7 @@ from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
+from mmpi_ns.ops.march.rays import Capacity as Capacity
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity

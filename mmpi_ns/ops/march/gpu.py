@@ -218,7 +218,8 @@ class Slots(NamedTuple):
 def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
     """``march`` up to where its result is packed, or summed."""
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
-    threshold, room = float(options.threshold), options.most_kept(layout.most_samples)
+    threshold, capacity = float(options.threshold), options.capacity
+    room = options.most_kept(layout.most_samples) if capacity is None else capacity.slots
     # Where all heads may answer, what stands for the choice is not read.
     parts = [rays.origins if x is None else x for x in dense_fields(rays)]
     m = Slots(
@@ -245,15 +246,18 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
 
 
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
-    """Waits for the device once, to size the result."""
-    m = march_into_slots(layout, tables, rays, options)
-    widest, *of_heads = m.numbers.tolist()
-    width = max(1, widest)
-    valid = torch.arange(width, device=m.kept.device) < m.kept[:, None]
+    """Waits for the device once, to size the result, unless its capacity is given."""
+    m, capacity = march_into_slots(layout, tables, rays, options), options.capacity
+    if capacity is None:
+        widest, *of_heads = m.numbers.tolist()
+        kept, width = m.kept, max(1, widest)
+    else:
+        of_heads, width, kept = capacity.heads, capacity.slots, m.kept.clamp(max=capacity.slots - 1)
+    valid = torch.arange(width, device=m.kept.device) < kept[:, None]
     packed = (torch.where(valid.view(valid.shape + (1,) * (x.ndim - 2)), x[:, :width], 0) for x in m.samples)
     heads, planes, *others = packed
     left = (m.skipped_total, m.dropped_mass, m.live, m.explained, tuple(of_heads))
-    return MergedSamples(heads.long(), planes.long(), *others, valid, *left)
+    return MergedSamples(heads.long(), planes.long(), *others, valid, *left, capacity, m.numbers)
 
 
 def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:

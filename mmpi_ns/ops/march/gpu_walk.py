@@ -52,8 +52,9 @@ ENDLESS, REACHED = tl.constexpr(1e30), tl.constexpr(1e9)
 """Distance to what a ray never reaches, and number of samples of the cube beyond which it reaches none."""
 NEGLIGIBLE = tl.constexpr(ends.NEGLIGIBLE)
 NEAREST_ZERO = tl.constexpr(ends.NEAREST_ZERO)
-ULPS = tl.constexpr(16 * 2.0**-23)
-"""Slack of the border test, as in ``geometry.local_to_ndc``."""
+ULPS, BORDER = tl.constexpr(16 * 2.0**-23), tl.constexpr(1 + 16 * 2.0**-23)
+"""Slack of the border test, as in ``geometry.local_to_ndc``, and the border with it: Triton 3.8's interpreter adds no
+constant to a number."""
 
 # Crossings -----------------------------------------------------------------------------------------------------------
 
@@ -300,7 +301,7 @@ def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, he
         u, v = (ox * inverse_t + lx) / depth - tl.load(mpi + U0), (oy * inverse_t + ly) / depth - tl.load(mpi + V0)
         u, v = u * tl.load(mpi + U_SCALE) - 1, v * tl.load(mpi + V_SCALE) - 1
         s = 1 - tl.load(mpi + S_SCALE) * (inverse_t / depth - tl.load(mpi + END))
-        inside = (tl.abs(u) <= 1 + ULPS) & (tl.abs(v) <= 1 + ULPS) & (tl.abs(s) <= 1 + ULPS / tl.load(mpi + SHARE))
+        inside = (tl.abs(u) <= BORDER) & (tl.abs(v) <= BORDER) & (tl.abs(s) <= 1 + ULPS / tl.load(mpi + SHARE))
         u, v, s = tl.where(ahead, u, 0.0), tl.where(ahead, v, 0.0), tl.where(ahead, s, 0.0)
         own_vote, highest, others = _count_vote(
             own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, ahead & inside, thick

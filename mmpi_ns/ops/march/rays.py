@@ -29,6 +29,17 @@ class Rays(NamedTuple):
     """Of the MPIs: each ray is answered by the first one of those it meets (and by the cube). None: by all."""
 
 
+class Capacity(NamedTuple):
+    """Room for the samples of a training batch, so that the sizes of its arrays are known before it is marched."""
+
+    slots: int
+    """Of each ray; the last one stays empty."""
+    heads: tuple[int, ...]
+    """Samples of each head."""
+    rows: int
+    """Distinct rows of the tables."""
+
+
 class MarchOptions(NamedTuple):
     """Which samples are kept, and how they are blended."""
 
@@ -38,6 +49,9 @@ class MarchOptions(NamedTuple):
     """Bound on the threshold relative to equal weights (``march.prune``)."""
     blends: bool = False
     """Samples are blended by reliability."""
+    capacity: Capacity | None = None
+    """On a GPU: the sizes of what is returned, so that nothing is waited for. Samples beyond are left out
+    (``MergedSamples.numbers`` says so). None: as many as there are."""
 
     def most_kept(self, samples: int) -> int:
         """How many of a ray's samples are kept at most: weights sum to at most 1, and each exceeds the bound."""
@@ -69,7 +83,11 @@ class MergedSamples:
     """Whether the heads that may answer must explain the whole ray: they cover it from before the first content out to
     infinity, or all heads may answer and one does."""
     head_counts: tuple[int, ...] | None = None
-    """Samples of each head, if known without synchronising."""
+    """Samples of each head, if known without synchronising; with a capacity those that there is room for."""
+    capacity: Capacity | None = None
+    """See ``MarchOptions``."""
+    numbers: Int[Tensor, "1+H"] | None = None
+    """The most that a ray keeps, then what is kept of each head; with a capacity alone."""
 
     @property
     def places(self) -> Places:

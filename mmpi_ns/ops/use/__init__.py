@@ -13,7 +13,7 @@ from mmpi_ns.ops.layout import dense
 from mmpi_ns.scene.texels import BRICK
 
 
-@operation(check=check_taps)
+@operation("gpu", check=check_taps)
 def note_use(
     rows: Int[Tensor, "U"],
     taps: list[Taps],

@@ -1,0 +1,98 @@
+"""Compositing on a GPU: a row of lanes for each ray, in one launch, and its gradient in another."""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from mmpi_ns.ops.composite import Composite
+from mmpi_ns.ops.gpu_scene import block_size, launch, one_minus_exp
+from mmpi_ns.ops.layout import dense
+
+NUMBERS = 512
+"""Slots of a program."""
+
+
+@triton.jit
+def slots_of(row, num_rays, slots, SLOTS: tl.constexpr, BLOCK: tl.constexpr):
+    """Rays of a program, their slots, where these are, and which exist."""
+    ray, slot = (row * BLOCK + tl.arange(0, BLOCK))[:, None], tl.arange(0, SLOTS)[None, :]
+    return ray, slot, ray.to(tl.int64) * slots + slot, (ray < num_rays) & (slot < slots)
+
+
+@triton.jit
+def _light(taus, valids, befores, slot, at, inside):
+    """Optical depth of each slot, the light before it, and which slots hold a sample."""
+    valid = inside & (tl.load(valids + at, inside, 0) != 0)
+    earlier = inside & (slot > 0)
+    earlier = earlier & (tl.load(valids + at - 1, earlier, 0) != 0)
+    passed = tl.cumsum(tl.load(taus + at - 1, earlier, 0.0), 1)  # summed, not subtracted
+    return tl.load(taus + at, valid, 0.0), tl.exp(-(passed + tl.load(befores + at, valid, 0.0))), valid
+
+
+@triton.jit(do_not_specialize=("num_rays", "slots"))
+def composite_kernel(
+    taus, valids, befores, totals, weights, depths, num_rays, slots, SLOTS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Weights of samples, and optical depths of rays."""
+    ray, slot, at, inside = slots_of(tl.program_id(0), num_rays, slots, SLOTS, BLOCK)
+    tau, light, valid = _light(taus, valids, befores, slot, at, inside)
+    tl.store(weights + at, tl.where(valid, light * one_minus_exp(tau), 0.0), inside)
+    depth = tl.sum(tau, 1)[:, None]
+    tl.store(depths + ray, depth + tl.load(totals + ray, ray < num_rays, 0.0), ray < num_rays)
+
+
+@triton.jit(do_not_specialize=("num_rays", "slots", "to_weights", "to_depths"))
+def composite_back_kernel(
+    taus, valids, befores, weights, to_weights, to_depths, to_taus, num_rays, slots,
+    SLOTS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Gradients of optical depths."""
+    ray, slot, at, inside = slots_of(tl.program_id(0), num_rays, slots, SLOTS, BLOCK)
+    tau, light, valid = _light(taus, valids, befores, slot, at, inside)
+    later = inside & (slot + 1 < slots)
+    hidden = tl.load(weights + at + 1, later, 0.0) * tl.load(to_weights + at + 1, later, 0.0)
+    slope = light * tl.exp(-tau) * tl.load(to_weights + at, valid, 0.0) - tl.cumsum(hidden, 1, reverse=True)
+    slope += tl.load(to_depths + ray, ray < num_rays, 0.0)
+    tl.store(to_taus + at, tl.where(valid, slope, 0.0), inside)
+
+
+def tiles(slots: int, device: torch.device) -> dict[str, int]:
+    """Slots and rays of a program."""
+    columns = int(triton.next_power_of_2(max(1, slots)))
+    return {"SLOTS": columns, "BLOCK": block_size(max(1, NUMBERS // columns), device)}
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+        weights, depth, sizes = torch.empty_like(tau), torch.empty_like(total), tiles(tau.shape[1], tau.device)
+        if tau.numel():
+            launch(composite_kernel, len(tau), sizes["BLOCK"], tau, valid, before, total, weights, depth, *tau.shape,
+                   **sizes)  # fmt: skip
+        else:
+            depth.copy_(total)
+        ctx.save_for_backward(tau, valid, before, weights)
+        return weights, depth
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        tau, valid, before, weights = ctx.saved_tensors
+        grad, sizes = torch.empty_like(tau), tiles(tau.shape[1], tau.device)
+        if tau.numel():
+            given = (g.contiguous() for g in grad_outputs)
+            launch(composite_back_kernel, len(tau), sizes["BLOCK"], tau, valid, before, weights, *given, grad,
+                   *tau.shape, **sizes)  # fmt: skip
+        return grad, None, None, None
+
+
+def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
+    tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(skipped_before, skipped_total))
+    weights, depth = _Composite.apply(*tensors)  # type: ignore[misc]
+    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))

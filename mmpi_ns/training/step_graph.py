@@ -1,0 +1,349 @@
+"""A training step on a GPU as two CUDA graphs: what draws, renders and finds gradients, and what takes the step.
+
+A step launches some hundreds of small kernels, and the host needs longer to launch them than the GPU to run them. A
+graph launches them at once. It repeats a step on the same memory, so all sizes are fixed (``Capacity``), nothing is
+waited for, random streams start anew from outside (``Generators``), and numbers that change lie in tensors.
+
+Steps of a kind are recorded after a few that were run one operation at a time and measured how many samples there are.
+A step whose samples do not fit changes nothing. The host hears of it some steps later and records again with more room.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter, deque
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from torch.nn import Parameter
+
+from mmpi_ns.data.datamanager import MMPIDataManager
+from mmpi_ns.ops.interpolate import Table
+from mmpi_ns.ops.march import Capacity
+from mmpi_ns.training.agreement import CLOSE, on_same_rows
+from mmpi_ns.training.losses import TV_EVERY
+from mmpi_ns.training.touched_adam import TouchedAdam
+from mmpi_ns.utils.errors import brief, say
+from mmpi_ns.utils.random_draws import Generators
+
+MEASURED = 3
+"""Steps after a change of the tables that are measured before one is recorded."""
+MARGIN = 1.125
+"""Room over the most samples so far: of a hundred steps none had more than 1.044 times those of the sixteen before."""
+MORE = 1024
+"""Room for so many samples of each head, and rows, beyond that."""
+FULL = 0.97
+"""Share of the room from which there is more of it from the next step on."""
+LATE = 4
+"""Steps that the host runs ahead at most."""
+SMALL = 1e-4
+"""Values below are compared as if they were this large."""
+
+
+class Recording(Protocol):
+    """Operations that can be repeated."""
+
+    def replay(self) -> None: ...
+
+
+class Recorder:
+    """Records what a function does on a GPU, without doing it."""
+
+    def __init__(self) -> None:
+        self.pool = torch.cuda.graph_pool_handle()
+
+    def record(self, run: Callable[[], None], generators: list[torch.Generator]) -> Recording:
+        graph = torch.cuda.CUDAGraph()
+        for g in generators:
+            graph.register_generator_state(g)
+        # Threads that show images meanwhile may allocate memory, and a kernel may be compiled or loaded.
+        with torch.cuda.graph(graph, pool=self.pool, capture_error_mode="relaxed"):
+            run()
+        return graph
+
+
+@dataclass
+class Results:
+    """What a step leaves behind for the host: tensors that the next step of the kind overwrites."""
+
+    names: list[tuple[str, str]] = field(default_factory=list)
+    """("loss" or "metric", name) of the values."""
+    values: Tensor | None = None
+    """[V], the sum of all losses first."""
+    used: Int[Tensor, "2+H"] | None = None
+    """Slots of the widest ray, samples of each head, and distinct rows."""
+
+    def told(self) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        """As ``Trainer.train_iteration`` returns it."""
+        assert self.values is not None
+        total, *values = self.values.detach().clone().unbind()
+        kinds: dict[str, dict[str, Tensor]] = {"loss": {}, "metric": {}}
+        for (kind, name), value in zip(self.names, values, strict=True):
+            kinds[kind][name] = value
+        return total, kinds["loss"], kinds["metric"]
+
+
+@dataclass
+class Recorded:
+    """Steps of a kind."""
+
+    gradients: Recording
+    update: Recording
+    results: Results
+    learning: list[tuple[TouchedAdam, list[Parameter]]]
+    """Parameters whose step the host counts."""
+
+
+class StepGraphs:
+    """Trains a model on a GPU, with graphs once it is known how much room steps need.
+
+    Args:
+        model: ``MMPIModel``, to train.
+        manager: its rays.
+        optimizers: by kind of parameter.
+        recorder: of graphs.
+    """
+
+    def __init__(self, model: Any, manager: MMPIDataManager, optimizers: dict[str, Any], recorder: Any = None) -> None:
+        self.model, self.manager, self.optimizers = model, manager, optimizers
+        self.new_recorder = recorder or Recorder
+        self.generators: tuple[Generators, ...] = (manager.draws, model.draws)
+        self.is_off = False
+        """Recording has failed: steps run one operation at a time."""
+        self.repeated = self.lost = 0
+        """Steps that were replayed, and steps whose samples did not fit."""
+        self._compared: set[Any] = set()
+        self._state: tuple[Any, ...] = ()
+        self._forget()
+
+    def _forget(self) -> None:
+        """The tables have changed: nothing that was recorded holds any more."""
+        self._recorded: dict[Any, Recorded] = {}
+        self._pending: deque[tuple[Any, Tensor, Capacity]] = deque()
+        self._measured, self._most, self.capacity = 0, Counter[int](), None
+        self._recorder = None
+
+    # A step ------------------------------------------------------------------------------------------------------
+
+    def step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        """Trains one step; losses and metrics as ``Trainer.train_iteration`` returns them."""
+        kind = self._kind(step)
+        self._hear(wait=False)
+        if self.is_off or self._measured < MEASURED:
+            return self._measured_step(step)
+        recorded = self._recorded.get(kind)
+        if recorded is None:
+            try:
+                recorded = self._record(step, kind)
+            except RuntimeError as error:
+                self._give_up(f"the driver refuses to record it ({brief(error)})")
+                return self._measured_step(step)
+            if recorded is None:
+                return self._measured_step(step)
+            self._recorded[kind] = recorded
+        else:
+            self._start(step)
+            recorded.gradients.replay()
+        for optimizer, params in recorded.learning:
+            optimizer.advance(params)
+        recorded.update.replay()
+        self.repeated += 1
+        self._send(recorded.results)
+        return recorded.results.told()
+
+    def _kind(self, step: int) -> Any:
+        """What steps have in common that do the same operations on the same memory. Forgets what was recorded before a
+        change of the tables."""
+        model, manager = self.model, self.manager
+        run, fields = model.run, model.field
+        schedule = model.progress.schedule
+        state = (fields._packed, fields.peak, fields.gain, fields.crossings, fields.touched, manager.sources)
+        state += (schedule.phase_at(step).name, schedule.sharpened(step), manager.share_of_rays, run.progress.window)
+        if len(state) != len(self._state) or any(
+            a is not b and not (isinstance(a, str | float | int) and a == b)
+            for a, b in zip(state, self._state, strict=True)
+        ):
+            self._forget()
+            self._state = state
+        return step % TV_EVERY == 0, schedule.watches(step)
+
+    def _start(self, step: int) -> None:
+        """Sets what recorded steps take from outside."""
+        self.model.decay.fill_(self.model.progress.schedule.decay(step))
+        for generators in self.generators:
+            generators.start(step)
+
+    def _zero_grad(self) -> None:
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+
+    def _find_gradients(self, step: int, capacity: Capacity | None) -> Results:
+        """Draws rays, renders them and finds gradients of the losses; nothing is changed but the records of use."""
+        model, results = self.model, Results()
+        model.capacity = capacity
+        try:
+            bundle, batch = self.manager.next_train(step)
+            outputs = model(bundle)
+            metrics = model.get_metrics_dict(outputs, batch)
+            losses = model.get_loss_dict(outputs, batch, metrics)
+        finally:
+            model.capacity = None
+        total = functools.reduce(torch.add, losses.values())
+        rays = outputs["training"]
+        if capacity is not None:
+            numbers, distinct = rays.samples.numbers, rays.lookup.distinct
+            results.used = torch.cat([numbers, distinct[None].to(numbers.dtype)])
+            fits = (numbers[0] < capacity.slots) & (distinct <= capacity.rows)
+            for number, most in zip(numbers[1:].unbind(), capacity.heads, strict=True):
+                fits = fits & (number <= most)
+            (total * fits).backward()
+        else:
+            total.backward()
+            self._measure(rays)
+        named = [("loss", n, x) for n, x in losses.items()] + [("metric", n, x) for n, x in metrics.items()]
+        results.names = [(what, name) for what, name, _ in named]
+        results.values = torch.stack([x.detach().float().reshape(()) for x in (total, *(x for _, _, x in named))])
+        return results
+
+    def _measured_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        """One operation at a time, with as much room as there are samples."""
+        self._zero_grad()
+        results = self._find_gradients(step, None)
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+        return results.told()
+
+    # Room --------------------------------------------------------------------------------------------------------
+
+    def _measure(self, rays: Any) -> None:
+        samples, lookup = rays.samples, rays.lookup
+        self._measured += 1
+        self._note([samples.valid.shape[1], *(samples.head_counts or ()), len(lookup.rows)])
+
+    def _note(self, used: list[int]) -> None:
+        """Counts what a step needed into the room of the next ones."""
+        for place, number in enumerate(used):
+            self._most[place] = max(self._most[place], number)
+        slots, *heads, rows = (int(MARGIN * self._most[place]) for place in range(len(used)))
+        self.capacity = Capacity(slots + 2, tuple(n + MORE for n in heads), rows + MORE)
+
+    def _send(self, results: Results) -> None:
+        """Has the numbers of a step copied to the host."""
+        assert results.used is not None and self.capacity is not None
+        if results.used.is_cuda:
+            here = torch.empty(results.used.shape, dtype=results.used.dtype, pin_memory=True)
+            here.copy_(results.used, non_blocking=True)
+            event = torch.cuda.Event()
+            event.record()
+        else:
+            here, event = results.used.clone(), None
+        self._pending.append((event, here, self.capacity))
+        self._hear(wait=len(self._pending) > LATE)
+
+    def _hear(self, wait: bool) -> None:
+        """Reads the numbers of steps that are finished; ``wait``: of one at least."""
+        while self._pending:
+            event, here, capacity = self._pending[0]
+            if event is not None and not event.query():
+                if not wait:
+                    return
+                event.synchronize()
+            wait = False
+            self._pending.popleft()
+            used, room = here.tolist(), (capacity.slots - 1, *capacity.heads, capacity.rows)
+            self.lost += any(n > most for n, most in zip(used, room, strict=True))
+            full = [n > FULL * most for n, most in zip(used, room, strict=True)]
+            if any(full) and capacity is self.capacity:  # what does not fit may not be counted whole
+                counts = zip(used, room, full, strict=True)
+                self._note([max(n, int(MARGIN * n), most) if is_full else n for n, most, is_full in counts])
+                self._recorded = {}
+
+    # Recording ---------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _recording(self):
+        for generators in self.generators:
+            generators.recording = True
+        try:
+            yield
+        finally:
+            for generators in self.generators:
+                generators.recording = False
+
+    def _record(self, step: int, kind: Any) -> Recorded | None:
+        """Records a kind of step and runs its first half; None where it would compute something else."""
+        capacity, fields = self.capacity, self.model.field
+        assert capacity is not None
+        of_kind = (*kind, *self._state[6:])
+        expected = None
+        if of_kind not in self._compared:
+            kept = fields.gain.clone(), fields.crossings.clone()
+            self._zero_grad()
+            results = self._find_gradients(step, capacity)
+            expected = results.values, self._gradients()
+            fields.gain.copy_(kept[0])
+            fields.crossings.copy_(kept[1])
+        self._zero_grad()
+        if self._recorder is None:
+            self._recorder = self.new_recorder()
+        streams = [g for generators in self.generators for g in generators.held.values()]
+        held: list[Results] = []
+        with self._recording():
+            gradients = self._recorder.record(lambda: held.append(self._find_gradients(step, capacity)), streams)
+        optimizers = [o for o in self.optimizers.values() if isinstance(o, TouchedAdam)]
+        learning = [(o, params) for o in optimizers if (params := o.learning())]
+        self._start(step)
+        gradients.replay()
+        if expected is not None:
+            if differs := self._difference(expected, (held[0].values, self._gradients())):
+                self._give_up(f"it repeats otherwise than it was recorded ({differs})")
+                return None
+            self._compared.add(of_kind)
+
+        def update() -> None:
+            for optimizer, _ in learning:
+                optimizer.apply()
+
+        with self._recording():
+            updates = self._recorder.record(update, [])
+        self._zero_grad()
+        return Recorded(gradients, updates, held[0], learning)
+
+    def _gradients(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Gradients by rows."""
+        found = {}
+        for name, parameter in self.model.field.named_parameters():
+            gradient = parameter.grad
+            if gradient is not None:
+                rows = parameter.grad_rows if isinstance(parameter, Table) else None
+                rows = torch.arange(len(gradient), device=gradient.device) if rows is None else rows
+                found[name] = rows.clone(), gradient.detach().double().flatten(1)
+        return found
+
+    @staticmethod
+    def _difference(expected: Any, repeated: Any) -> str:
+        """In words; empty where they agree but for what the order of atomic sums explains."""
+        (values, gradients), (others, their) = expected, repeated
+        wrong = []
+        error = float(((others - values).abs() / values.abs().clamp(min=SMALL)).max())
+        if not error <= CLOSE:
+            wrong.append(f"losses by {error:.1%}")
+        for name, (rows, gradient) in gradients.items():
+            first, second = on_same_rows((rows, gradient), their[name])
+            error = float((first - second).norm() / first.norm().clamp(min=1e-12))
+            if not error <= CLOSE:
+                wrong.append(f"gradients of {name} by {error:.1%}")
+        return ", ".join(wrong)
+
+    def _give_up(self, reason: str) -> None:
+        self.is_off = True
+        self._forget()
+        self._zero_grad()
+        for generators in self.generators:
+            generators.held.clear()
+        say(f"Steps run one operation at a time, several times slower: {reason}.", "yellow")
