@@ -26,7 +26,7 @@ from mmpi_prepare import checks, export, features, images
 from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, map_known_poses
 from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_prepare.mapping import Task, map_and_judge
-from mmpi_prepare.poses import GIVEN_COUNTS, make_cameras, opencv_camera, read_poses
+from mmpi_prepare.poses import GIVEN_COUNTS, agreeing, make_cameras, opencv_camera, read_poses
 from mmpi_prepare.settings import RANGES, Settings, read_lists
 from mmpi_prepare.verdict import REMEDY, Verdict
 from mmpi_priors.sfm import load_pycolmap, match_pairs, new_model, quiet, rigid3d
@@ -164,8 +164,10 @@ class Preparation:
         if self.known_poses is not None and s.matching == "auto":
             places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
             poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
-            pairs = [(places[i], places[j]) for i, j in near_pairs(poses[:, :3], 2 * s.overlap)]
-            says = f"the {2 * s.overlap} nearest by pose"
+            # Poses that are wrong name wrong neighbours: the next images are evidence beside them.
+            near = {*near_pairs(poses[:, :3], 2 * s.overlap), *((i, i + 1) for i in range(len(places) - 1))}
+            pairs = sorted((places[i], places[j]) for i, j in near)
+            says = f"the {2 * s.overlap} nearest by pose, and the next"
         else:
             alike = features.image_similarity(database, len(names))
             pairs, says = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
@@ -182,11 +184,16 @@ class Preparation:
         s, names = self.settings, [p.name for p in self.photos]
         verdict, groups, focal = Verdict("right"), [], None
         if self.known_poses is not None:
-            poses = {n: rigid3d(p) for n, p in self.known_poses.poses.items()}
-            model = new_model(self.cameras, names, self.numbers, poses)
+            known = self.known_poses
+            for is_last in (s.poses_axes != "auto", True):
+                poses = {n: rigid3d(p) for n, p in known.poses.items()}
+                model = new_model(self.cameras, names, self.numbers, poses)
+                if is_last:
+                    break
+                known = agreeing(known, model, database)
             refine = not self.is_fixed and s.refine_intrinsics
             model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
-            says = f"{self.known_poses.says}; {says}"
+            says = f"{known.says}; {says}"
         else:
             lens, is_sequence = not self.is_fixed, self.matching.startswith("sequential")
             free = lens, lens and s.lens == "auto", s.camera is None or s.refine_intrinsics

@@ -15,8 +15,9 @@ import pycolmap
 
 from mmpi_ns.data.checks import MAP_COORDINATES
 from mmpi_ns.utils.errors import InputError, say
-from mmpi_prepare.adjustment import Array, nearest_rotation
+from mmpi_prepare.adjustment import Array, camera_poses, nearest_rotation
 from mmpi_prepare.images import IMAGES, Photo, natural_key
+from mmpi_priors.conventions import Matches, find_convention, in_words
 
 Lens = Literal["auto", "pinhole", "radial", "opencv", "fisheye"]
 Sharing = Literal["auto", "shared", "per-image"]
@@ -96,6 +97,8 @@ class KnownPoses:
     """Of the same images, from a transforms.json."""
     split: dict[str, Any] | None = None
     """A transforms.json's lists of files."""
+    axes: Array = field(default_factory=lambda: np.eye(3))
+    """The axes that the file's matrices are taken to have, as in ``conventions.py``."""
 
 
 def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
@@ -144,7 +147,30 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
             pose[:3, 3] -= origin
         place = ", ".join(f"{x:.10g}" for x in origin)
         read = replace(read, says=f"{read.says}, in map coordinates, of which ({place}) is subtracted")
-    return replace(read, poses=poses)
+    return replace(read, poses=poses, axes=flip[:3, :3])
+
+
+def agreeing(known: KnownPoses, model: pycolmap.Reconstruction, database: Path) -> KnownPoses:
+    """The poses, read in the convention that explains the verified matches of a database, if theirs does not.
+
+    ``model`` has the poses and cameras. Raises InputError if these contradict the matches for another reason."""
+    names, poses = camera_poses(model)
+    matrices, cameras = poses.copy(), [model.cameras[image.camera_id] for _, image in sorted(model.images.items())]
+    matrices[:, :3, :3] = poses[:, :3, :3] @ known.axes
+    focals = np.array([[c.focal_length_x, c.focal_length_y] for c in cameras])
+    widths, centers = (np.array([getattr(c, k) for c in cameras], float) for k in ("width", "principal_point_x"))
+    centers = np.stack([centers, [c.principal_point_y for c in cameras]], -1)
+    lens = focals[:, 0] / widths, focals, centers
+    as_given, better, is_wrong = find_convention(matrices, known.axes, lens, Matches.of(model, database))
+    if better is None:
+        return known
+    says = in_words(better, known.axes, float(focals[0, 0]), float(widths.mean()), as_given.error)
+    if better.focal != 1.0 or better.bend is not None:
+        if is_wrong:
+            raise InputError(f"The intrinsics contradict the images. {says} Give --focal or --camera.")
+        return known
+    say(says, "yellow")
+    return replace(known, poses=dict(zip(names, better.applied(matrices), strict=True)), says=f"{known.says}. {says}")
 
 
 def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:

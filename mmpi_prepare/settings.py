@@ -34,7 +34,8 @@ class Settings:
     poses: Path | None = None
     """Known poses: a KITTI or TUM file, a transforms.json, or a folder of 4x4 text files."""
     poses_axes: Literal["auto", "opencv", "opengl"] = "auto"
-    """Camera axes of --poses (camera to world): auto is opengl for transforms.json and opencv for the others."""
+    """Camera axes of --poses (camera to world). auto: opengl for transforms.json and opencv for the others, or what the
+    matches show."""
     refine_poses: bool = False
     """Refine known poses by bundle adjustment; frame and scale are kept."""
     focal: float | None = None

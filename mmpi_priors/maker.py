@@ -37,6 +37,7 @@ class CapturePriors(PriorsMaker):
         return observe(
             self.outputs, self.dataset, self.parser, self.config.sfm_path,
             find_points=find_points, triangulates=self.config.triangulate,
+            trusts=self.config.trust_cameras,
         )  # fmt: skip
 
     def make(self) -> Priors:

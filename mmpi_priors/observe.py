@@ -11,7 +11,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +30,9 @@ from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.posed_images import PosedImages, at_full_size, camera_observations, posed_images
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
-from mmpi_ns.utils.errors import quoted
+from mmpi_ns.utils.errors import InputError, quoted
 from mmpi_priors.cache import Arrays, kept
+from mmpi_priors.conventions import OPENGL, Matches, find_convention, in_words
 from mmpi_priors.patches import search_surfaces
 from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
 from mmpi_priors.tracks import SAME_PLACE, triangulate
@@ -72,6 +75,7 @@ def observe(
     *,
     find_points: bool,
     triangulates: bool,
+    trusts: bool,
 ) -> Observations:
     """The observations of a training data set. Raises InputError for poses or intrinsics that cannot be used.
 
@@ -80,6 +84,7 @@ def observe(
         parser: settings of the data parser, whose COLMAP model is read if it has one.
         sfm_path: of a COLMAP model beside the frames otherwise; it need not exist.
         find_points, triangulates: search the images for points if there are no tracks; first by matched features.
+        trusts: go on with cameras that contradict their images.
     """
     data = Path(parser.data)
     folder = data.parent if data.suffix == ".json" else data
@@ -89,7 +94,8 @@ def observe(
         CONSOLE.print("[bold yellow]All training cameras stand in one place: no distance can be learned.")
     if find_points:
         if not len(observations.seen_by):
-            observations = _find_points(observations, dataset, triangulates)
+            check = partial(check_cameras, file_matrices(observations, outputs, folder), trusts=trusts)
+            observations = _find_points(observations, dataset, triangulates, check)
         else:
             if observations.loose is not None:
                 say_once("Point cloud: not used, as the SfM tracks tell of each point which images saw it.")
@@ -101,8 +107,15 @@ def observe(
     return observations
 
 
-def _find_points(observations: Observations, dataset: MMPIDataset, triangulates: bool) -> Observations:
-    """Points of a scene without tracks: triangulated, and on searched surfaces if triangulation finds too few."""
+def _find_points(
+    observations: Observations,
+    dataset: MMPIDataset,
+    triangulates: bool,
+    check: Callable[[PosedImages, SfmModel], bool],
+) -> Observations:
+    """Points of a scene without tracks: triangulated, and on searched surfaces if triangulation finds too few.
+
+    ``check`` tells whether cameras were found to contradict the matches, after it said so."""
     images = posed_images(observations, dataset)
     if images is None:
         CONSOLE.print("Cameras that are neither perspective nor fisheye: no features are matched.")
@@ -119,7 +132,8 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
         model = SfmModel(**{**stored, "off": stored["off"].item()})
         CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
         observations = with_tracks(observations, model)
-        tell_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
+        if not check(originals, model):
+            tell_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
     if images is not None and len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
         CONSOLE.print("Few or no tracks: a quick search for surfaces locates the content.")
         observations = with_surfaces(observations, at_full_size(images))
@@ -154,6 +168,53 @@ def with_surfaces(observations: Observations, images: PosedImages) -> Observatio
         points.append(places)
     joined = (np.concatenate(parts) for parts in (points, seen_by, seen_point))
     return replace(observations, **dict(zip(("points", "seen_by", "seen_point"), joined, strict=True)))
+
+
+def file_matrices(observations: Observations, outputs: DataparserOutputs, folder: Path) -> Array:
+    """The cameras' matrices as they are in transforms.json, before the data parser moved and scaled them. [M, 4, 4]"""
+    moved = outputs.dataparser_transform.double().numpy()
+    with suppress(OSError, ValueError, KeyError):  # another parser, or a file without it
+        applied = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))["applied_transform"]
+        moved = moved @ np.linalg.inv(np.vstack([np.array(applied, np.float64)[:3], [0, 0, 0, 1]]))
+    matrices = np.tile(np.eye(4), (len(observations.camera_to_worlds), 1, 1))
+    matrices[:, :3] = observations.camera_to_worlds
+    matrices[:, :3, 3] /= outputs.dataparser_scale
+    matrices[:, :3, 3] -= moved[:, 3]
+    matrices[:, :3] = moved[:, :3].T @ matrices[:, :3]
+    return matrices
+
+
+def check_cameras(matrices: Array, images: PosedImages, model: SfmModel, *, trusts: bool) -> bool:
+    """Whether cameras contradict verified matches, said in a sentence with the convention that explains them.
+
+    Raises InputError with this sentence where they cannot be used, unless they are to be trusted."""
+    table, width = model.matches, images.sizes[:, 0]
+    pairs = Matches(table[:, :2].astype(np.int64), *(table[:, c : c + 4].reshape(-1, 2, 2) for c in (2, 6)))
+    lens = images.intrinsics[:, 0] / width, images.intrinsics[:, :2], images.intrinsics[:, 2:]
+    as_given, better, is_wrong = find_convention(matrices, OPENGL, lens, pairs)
+    if better is None and not is_wrong:
+        return False
+    focal, pixels = float(images.intrinsics[0, 0]), float(width.mean())
+    if better is None:
+        says = (
+            f"The cameras contradict their images: matches are off by {as_given.error:.1%} of the width, and "
+            "no usual convention of axes, inversion, focal length or lens explains them. Are the poses those of "
+            "other images, or in another order?"
+        )
+    else:
+        says = in_words(better, OPENGL, focal, pixels, as_given.error)
+        says = f"The cameras contradict their images. {says}"
+        full = images.files[0].parent
+        if better.is_of_axes(OPENGL):
+            to, poses = full.parent.with_name(f"{full.parent.name}-converted"), full.parent / "transforms.json"
+            command = f"mmpi-prepare {quoted(full)} {quoted(to)} --poses {quoted(poses)}"
+            says = f"{says} Convert them: {command} reads them so."
+        else:
+            says = f"{says} Correct the intrinsics in transforms.json."
+    if is_wrong and not trusts:
+        raise InputError(f"{says} To train all the same: --pipeline.datamanager.priors.trust-cameras True.")
+    CONSOLE.print(says, style="bold yellow", markup=False, soft_wrap=True)
+    return True
 
 
 def tell_poses(off: float, image: Path) -> None:

@@ -21,6 +21,8 @@ class CapturePriorsConfig(PriorsConfig):
     """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
     triangulate: bool = True
     """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
+    trust_cameras: bool = False
+    """Train even if the cameras contradict the images (looked into in scenes without tracks)."""
     dense_depth: bool = True
     """Match the originals of neighbouring training images densely at the start, for the depth of most pixels (about a
     second for a million pixels on one core, on all cores; kept in ~/.cache/mmpi_ns for the next start)."""

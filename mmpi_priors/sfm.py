@@ -9,7 +9,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import ModuleType
@@ -52,6 +52,8 @@ class SfmModel:
     off: float = np.nan
     """Median distance of the matches from the epipolar lines of given poses, relative to the width of the image; NaN
     for a model read from files."""
+    matches: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 10)))
+    """[N, 10] some of the verified matches: two images, their rays and their rays without a lens (``Matches``)."""
 
 
 def find_sfm_model(path: Path) -> SfmModel | None:

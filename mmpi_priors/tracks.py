@@ -20,6 +20,7 @@ from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import opened
 from mmpi_priors import sfm
+from mmpi_priors.conventions import FINE, Matches
 from mmpi_priors.sfm import SfmModel, load_pycolmap, read_reconstruction
 
 NEIGHBOURS = 8
@@ -73,7 +74,7 @@ def triangulate(images: PosedImages) -> SfmModel:
     Deterministic for equal images and poses. A quick search is followed by a thorough one if it finds too little. The
     quick search takes about a third of a second for each image on one core, the thorough one a second. Raises
     InputError if an image file cannot be read."""
-    pycolmap, tracks, error = load_pycolmap(), None, np.nan
+    pycolmap, tracks, error, matches = load_pycolmap(), None, np.nan, None
     cameras = []
     for i, (width, height) in enumerate(images.sizes.astype(int).tolist()):
         lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
@@ -106,8 +107,15 @@ def triangulate(images: PosedImages) -> SfmModel:
                 error = _epipolar_error(database, model)
                 model = sfm.triangulate_points(model, database, work, pairs_alone=True)
             tracks = read_reconstruction(model, MIN_TRACK)
-    assert tracks is not None
-    return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
+            posed = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
+            if not error <= FINE and len(names) > 1:
+                # Poses that are wrong name wrong neighbours: images that follow each other are evidence beside them.
+                sfm.match_pairs(database, [(a, b) for k in (1, 2) for a, b in zip(names, names[k:], strict=False)])
+            matches = Matches.of(posed, database)
+    assert tracks is not None and matches is not None
+    table = np.concatenate([matches.images, *(x.reshape(-1, 4) for x in (matches.rays, matches.flat))], -1)
+    order = np.array([str(names.index(name)) for name in tracks.names], np.str_)
+    return replace(tracks, names=order, off=error, matches=table)
 
 
 def _epipolar_error(database: Path, model: Any) -> float:

@@ -13,7 +13,7 @@ import tyro
 from mmpi_ns.placement.defaults import DEFAULTS, check_placement, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
-from mmpi_ns.utils.errors import InputError, looked_at, quoted
+from mmpi_ns.utils.errors import InputError, looked_at, quoted, say
 from mmpi_ns.utils.host import enter_command, values_of
 
 if TYPE_CHECKING:
@@ -141,8 +141,11 @@ def load_observations(
     if not search:
         config.priors = replace(config.priors, mask_moving=False, dense_depth=False, depth_images=False)
     config.new_view_share = 0.0
+    manager = config.setup(device="cpu", test_mode="inference")
+    if not any(Path(file).is_file() for file in manager.train_dataset.image_filenames):
+        say(f"The images of {data} are not there: its cameras and points alone are judged.")
+        return manager.observations, manager
     manager = config.setup(device="cpu", test_mode="val")
-    assert manager.priors is not None
     return manager.priors.placement, manager
 
 

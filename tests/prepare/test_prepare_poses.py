@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import corridor
 import numpy as np
@@ -10,6 +11,7 @@ import pycolmap
 import pytest
 
 from mmpi_ns.utils.errors import InputError
+from mmpi_prepare.adjustment import camera_poses
 from mmpi_prepare.images import Photo
 from mmpi_prepare.pipeline import prepare
 from mmpi_prepare.poses import opencv_intrinsics, read_poses
@@ -192,10 +194,16 @@ def test_refining_brings_disturbed_poses_back(frames, tmp_path):
     assert "poses moved by" in (tmp_path / "scene/report.md").read_text()
 
 
-def test_poses_with_other_axes_are_refused(frames, tmp_path):
-    poses = write_kitti(tmp_path / "poses.txt", GIVEN @ FLIP)
+def test_poses_with_other_axes_are_read_so_or_refused_where_axes_were_given(frames, tmp_path, capsys):
+    poses = write_kitti(tmp_path / "poses.txt", np.linalg.inv(GIVEN @ FLIP))
+    how = Settings(frames, tmp_path / "scene", poses=poses, focal=corridor.FOCAL, threads=1)
     with pytest.raises(InputError, match="--poses-axes"):
-        prepare(Settings(frames, tmp_path / "scene", poses=poses, focal=corridor.FOCAL, threads=1))
+        prepare(replace(how, poses_axes="opencv"))
+    assert prepare(how).grade == "right"
+    said = "have OpenGL's camera axes (x right, y up, z back) and are world to camera, not camera to world"
+    assert said in capsys.readouterr().out.replace("\n", " ")
+    model = pycolmap.Reconstruction(tmp_path / "scene/colmap/sparse/0")
+    assert camera_poses(model)[1] == pytest.approx(GIVEN, abs=1e-6)
 
 
 def test_known_poses_want_intrinsics(frames, tmp_path):

@@ -117,9 +117,9 @@ def test_surfaces_are_searched_only_where_triangulation_finds_too_few_keypoints(
     monkeypatch.setattr(mmpi_observations, "at_full_size", lambda images: images)
     calls = []
     monkeypatch.setattr(mmpi_observations, "with_surfaces", lambda found, images: calls.append(images) or found)
-    found = mmpi_observations._find_points(bare(), as_data(), triangulates=True)
+    found = mmpi_observations._find_points(bare(), as_data(), True, lambda *_: False)
     assert len(found.seen_by) == 2 * each and len(calls) == searched
-    mmpi_observations._find_points(bare(), as_data(), triangulates=False)
+    mmpi_observations._find_points(bare(), as_data(), False, lambda *_: False)
     assert len(calls) == searched + 1 and len(calls[-1].files) == 2
 
 
@@ -203,12 +203,12 @@ def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkey
     assert waiting.loose == pytest.approx(np.array([[0, 0.1, -3]]), abs=1e-6)
     monkeypatch.setattr(mmpi_observations, "_find_points", lambda found, *_: found)
     data = as_data()
-    assert observe(outputs, data, *none, find_points=True, triangulates=True).loose is not None
+    assert observe(outputs, data, *none, find_points=True, triangulates=True, trusts=False).loose is not None
     names, seen_point = np.array(outputs.image_filenames), np.zeros(2, int)
     tracks = SfmModel(np.array([[0.0, 0, -3]]), names, np.arange(2), seen_point, np.full((2, 2), 0.5))
     monkeypatch.setattr(mmpi_observations, "find_sfm_model", lambda folder: tracks)
     monkeypatch.setattr(mmpi_observations, "drop_masked", lambda found, data: found)
     say_once.cache_clear()
-    found = observe(outputs, data, *none, find_points=True, triangulates=True)
+    found = observe(outputs, data, *none, find_points=True, triangulates=True, trusts=False)
     assert found.loose is None and len(found.points) == 1
     assert "Point cloud: not used" in capsys.readouterr().out
