@@ -62,7 +62,7 @@ class DenseSteps:
 
     def __init__(self, like: Steps) -> None:
         self.like, self.model, self.step, self.samples = like, like.pipeline.model, 0, 0.0
-        names = ("feature_channels", "hidden_width", "position_frequencies", "direction_frequencies")
+        names = ("feature_channels", "hidden_width")
         settings = {name: getattr(self.model.config.colour, name) for name in names}
         self.field = MMPIField(self.model.field.full_plan, **settings, shares_depth=True).to(self.model.device)
         for name in ("density", "features"):  # all rows have gradients here, so tables are plain parameters

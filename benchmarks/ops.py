@@ -22,8 +22,9 @@ from mmpi_ns.field.tables import Lookup
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.ops.interpolate import Table, index_rows, read_rows, sum_rows, weigh_rows
-from mmpi_ns.ops.march import MergedSamples, march, merge
-from mmpi_ns.rendering.rendered import bounded, rays_of
+from mmpi_ns.ops.march import MergedSamples
+from mmpi_ns.rendering.rendered import bounded
+from mmpi_ns.sampler import march, merge, rays_of
 from mmpi_ns.scripts.command import run
 
 COPIED = 1 << 26

@@ -18,10 +18,11 @@ from PIL import Image
 from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene, config_of, trainer_of
-from mmpi_ns.ops.march import MarchOptions, march
+from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.metrics import ImageMetrics
-from mmpi_ns.rendering.rendered import bounded, rays_of
+from mmpi_ns.rendering.rendered import bounded
+from mmpi_ns.sampler import march, rays_of
 from mmpi_ns.scene.windows import Window
 from mmpi_ns.scripts.command import run
 from mmpi_ns.scripts.plan import load_observations

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
+from mmpi_ns.blending import blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.placement.errors import mpi_errors
 from mmpi_ns.placement.observations import Observations

@@ -39,8 +39,8 @@ from mmpi_ns.rendering.rendered import (
     shown_outputs,
     winners,
 )
-from mmpi_ns.rendering.sampler import SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
+from mmpi_ns.sampler import SamplingConfig
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
@@ -179,7 +179,6 @@ class MMPIModel(Model):
             factor=schedule.texel_factor(0),
             views=views,
             **asdict(self.config.colour),
-            samples_per_voxel=self.config.sampling.samples_per_voxel,
             cube_alpha=self.config.sampling.cube_alpha,
         )
 

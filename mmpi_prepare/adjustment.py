@@ -5,6 +5,7 @@ metres."""
 from __future__ import annotations
 
 import copy
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -22,9 +23,10 @@ STILL = 1e-6
 that took four times as long, and moved the focal length by 0.002 px."""
 WORTH = 0.97
 """Fraction of the reprojection error to which a freed parameter must lower it."""
-SQUARE = 0.1
-"""Difference of the two focal lengths from which a lens is not believed: cameras have square pixels, and few images let
-the second focal length absorb other errors. A straight path hardly determines the ratio: a few percent do no harm."""
+SQUARE = 0.8
+"""The same for pixels that are not square, as those of some old video."""
+IMAGES_OF_LENS = 3
+"""Images of a camera from which more than one term of its lens can be told."""
 LARGEST_ERROR = 4.0
 """Reprojection error in pixels above which an observation is dropped."""
 ENOUGH_POINTS = 300
@@ -79,53 +81,85 @@ def adjust(
     model.update_point_3d_errors()
 
 
+def fit_error(model: pycolmap.Reconstruction) -> float:
+    """Root mean square of the points' errors in pixels, where single points that are lost count little."""
+    errors = np.array([point.error for point in model.points3D.values()])
+    lengths = np.array([point.track.length() for point in model.points3D.values()], np.float64)
+    errors = np.minimum(np.nan_to_num(errors, nan=np.inf), LARGEST_ERROR)
+    return float(np.sqrt((errors**2 * lengths).sum() / max(float(lengths.sum()), 1.0)))
+
+
+def worth(model: pycolmap.Reconstruction, parameters: int) -> float:
+    """Fraction of the error below which so many more parameters are believed: by the Bayesian information criterion,
+    that of all coordinates of keypoints, and ``WORTH`` at most."""
+    count = max(2 * model.compute_num_observations(), 2)
+    return min(WORTH, float(np.exp(-parameters * np.log(count) / (2 * count))))
+
+
+def turns_back(camera: pycolmap.Camera) -> bool:
+    """Whether a lens shows rays farther from its axis nearer to the middle, before the corner of the image."""
+    corner = np.hypot(camera.width / camera.focal_length_x, camera.height / camera.focal_length_y) / 2
+    terms = camera.params[camera.extra_params_idxs()][: 1 if camera.model.name == "SIMPLE_RADIAL" else 2]
+    squares = np.linspace(0, corner, 50) ** 2
+    slopes = 1 + sum(((2 * n + 3) * k * squares ** (n + 1) for n, k in enumerate(terms)), np.zeros(50))
+    return bool(slopes.min() <= 0)
+
+
 def polish(
     model: pycolmap.Reconstruction, threads: int, lens: bool, full_lens: bool, principal_point: bool
 ) -> pycolmap.Reconstruction:
-    """The model adjusted with more parameters free, if that lowers the error; what may be is as in ``mapping.Task``.
+    """The model adjusted with more parameters free, if that lowers the error by more than so many parameters would do
+    anyway, and no lens turns back; what may be is as in ``mapping.Task``.
 
-    Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point.
+    Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point, and a
+    second focal length whatever is left, as few images, a straight path and upright cameras hardly determine it. So
+    pixels are square unless that fits far worse. Cameras of few images keep one radial term.
     """
-    trials = []  # in words, and whether it is the four lens terms; else the principal point
+    images = Counter(model.images[i].camera_id for i in model.reg_image_ids())
+    several = [n for n, c in model.cameras.items() if c.model.name == "SIMPLE_RADIAL" and images[n] >= IMAGES_OF_LENS]
+    # In words, the lens model, whether both focal lengths are free, and the fraction of the error that is asked for.
+    trials: list[tuple[str, str, bool, float]] = []
     if principal_point:
-        trials.append(("the principal point free", False))
-    if full_lens and any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
-        trials.append(("OpenCV's four lens terms", True))
+        trials.append(("the principal point free", "", True, worth(model, 2 * len(model.cameras))))
+    if full_lens and several:
+        trials.append(("two radial terms", "RADIAL", True, worth(model, len(several))))
+        trials.append(("OpenCV's four lens terms", "OPENCV", False, worth(model, 3 * len(several))))
+        trials.append(("these and pixels that are not square", "OPENCV", True, SQUARE))
     if not trials:
         return model
-    center = four_terms = False
 
-    def adjusted(start: pycolmap.Reconstruction, four_terms: bool, center: bool) -> pycolmap.Reconstruction:
-        """A copy adjusted with cameras of one radial term as OpenCV's, if asked, and the principal point free."""
+    def adjusted(start: pycolmap.Reconstruction, kind: str, focal: bool, center: bool) -> pycolmap.Reconstruction:
+        """A copy adjusted with cameras as of another lens model, if asked, and the principal point free."""
         trial = copy.deepcopy(start)
-        for camera in trial.cameras.values() if four_terms else ():
-            if camera.model.name == "SIMPLE_RADIAL":
-                f, cx, cy, k = camera.params
-                camera.model = pycolmap.CameraModelId.OPENCV
-                camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+        for camera in (trial.cameras[n] for n in several) if kind else ():
+            f, cx, cy, *terms = camera.params
+            camera.model = getattr(pycolmap.CameraModelId, kind)
+            terms = [*terms, 0.0][:2]
+            camera.params = [f, cx, cy, *terms] if kind == "RADIAL" else [f, f, cx, cy, *terms, 0.0, 0.0]
         adjust(trial, threads, lens, center)
+        if not focal:  # COLMAP cannot tie the two focal lengths
+            for camera in (trial.cameras[n] for n in several):
+                camera.params[camera.focal_length_idxs()] = camera.mean_focal_length()
+            adjust(trial, threads, lens, center, focal=False)
         return trial
 
     with progress("Fitting the lens", 1 + len(trials)) as advance:
-        light = with_fewer_points(model)
+        light, center, chosen = with_fewer_points(model), False, ("", True)
         adjust(light, threads, lens)
         advance()
-        for says, is_lens in trials:
-            trial = adjusted(light, is_lens, center or not is_lens)
+        start = light
+        for says, kind, focal, share in trials:
+            trial = adjusted(start, kind, focal, center or not kind)
             advance()
-            # Root mean squares of the points' errors, each counted once for each image that sees it.
-            points = [[(p.error, p.track.length()) for p in m.points3D.values()] for m in (light, trial)]
-            columns = (np.array(rows, np.float64).reshape(-1, 2).T for rows in points)
-            before, after = (float(np.sqrt((e**2 * n).sum() / max(n.sum(), 1))) for e, n in columns)
-            stretch = max(abs(c.focal_length_x / c.focal_length_y - 1) for c in trial.cameras.values())
-            is_better, fate = after < WORTH * before, "not kept"
-            if is_better and stretch >= SQUARE:
-                is_better, fate = False, f"not kept, as pixels would be {stretch:.0%} off square"
-            fate = "kept" if is_better else fate
+            before, after = fit_error(light), fit_error(trial)
+            fate = "kept" if after < share * before else "not kept"
+            if fate == "kept" and any(turns_back(trial.cameras[n]) for n in several if kind):
+                fate = "not kept, as the lens would turn back before the corner"
             say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {fate}.")
-            if is_better:
-                light, center, four_terms = trial, center or not is_lens, four_terms or is_lens
-    return adjusted(model, four_terms, center) if center or four_terms else model
+            if fate == "kept":
+                light, center, chosen = trial, center or not kind, (kind, focal) if kind else chosen
+                start = start if kind else trial
+    return adjusted(model, *chosen, center) if center or chosen[0] else model
 
 
 def quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
@@ -221,12 +255,7 @@ def open_focals(model: pycolmap.Reconstruction, database: Path, threads: int) ->
         return {}
     light = with_fewer_points(model)
     adjust(light, threads, lens=True)
-    # Root mean squares of the points' errors in pixels, where single points that are lost count little.
-    errors = (
-        np.array([min(point.error, LARGEST_ERROR) for point in m.points3D.values()])
-        for m in (light, with_focals(light, noted, threads))
-    )
-    free, held = (float(np.sqrt((each**2).mean())) for each in errors)
+    free, held = fit_error(light), fit_error(with_focals(light, noted, threads))
     is_open = free > NOTED_WORTH * held
     focals = ", ".join(f"{focal:.0f}" for _, focal in sorted(noted.items())[:3])
     fate = "kept, as the images hardly determine it" if is_open else "not kept"

@@ -284,7 +284,9 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
         model, *rest = (with_focals(m, noted, task.threads) for m in (model, *(w.model for w in others)))
         judged = (_evidence(w.name, w.says, m, task) for w, m in zip(others, rest, strict=True))
         others = [witness for witness in judged if witness is not None]
+        before = None
     else:
+        before = chosen
         model = polish(model, task.threads, task.lens, task.full_lens, task.principal_point)
     polished = _evidence(chosen.name, chosen.says, model, task)
     grades = [ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished) if w is not None]
@@ -292,7 +294,7 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
         say("The final bundle adjustment makes the evidence worse: left out.", "yellow")
     else:
         chosen = polished
-    verdict = judge_together(chosen, others, task.is_ordered)
+    verdict = judge_together(chosen, others, task.is_ordered, before)
     beside = [f"{w.says}, {judge_alone(w, task.is_ordered).grade} by itself" for w in others]
     return chosen.model, "; beside it ".join([chosen.says, *beside]), verdict
 

@@ -28,7 +28,7 @@ from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_prepare.mapping import Task, map_and_judge
 from mmpi_prepare.poses import GIVEN_COUNTS, agreeing, make_cameras, opencv_camera, read_poses
 from mmpi_prepare.settings import RANGES, Settings, read_lists
-from mmpi_prepare.verdict import REMEDY, Verdict
+from mmpi_prepare.verdict import Verdict, remedy
 from mmpi_priors.sfm import load_pycolmap, match_pairs, new_model, quiet, rigid3d
 from mmpi_priors.tracks import near_pairs
 
@@ -83,10 +83,13 @@ class Preparation:
             )
         if verdict.grade == "broken" and not s.allow_doubtful:
             raise InputError(
-                f"The track that was found is wrong, so no scene was made. {verdict.says} {REMEDY} "
+                f"The track that was found is wrong, so no scene was made. {verdict.says} {self._remedy()} "
                 "To look at it all the same: --allow-doubtful."
             )
         return self._write(model, verdict)
+
+    def _remedy(self) -> str:
+        return remedy(len(self.cameras), self.is_video or self.matching.startswith("sequential"), self.is_fixed)
 
     def _stage(self, name: str, settings: Any, make: Callable[[Path], Any]) -> tuple[Path, Any]:
         """A stage's own folder, and the JSON that ``make``, which fills the folder, returned now or before: by these
@@ -324,7 +327,7 @@ class Preparation:
             say(line, "yellow")
         is_right = verdict.grade == "right"
         if not is_right:
-            say(f"This scene is {verdict.grade}: {verdict.says} {REMEDY}", "bold red")
+            say(f"This scene is {verdict.grade}: {verdict.says} {self._remedy()}", "bold red")
         say(
             f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
             f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",

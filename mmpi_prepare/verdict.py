@@ -42,10 +42,6 @@ TURNS = (
     "A camera that turns in one place explains all matches, so that no distance is known: take images from places that "
     "are apart."
 )
-REMEDY = (
-    "Give --focal (and --lens) if you know them, mask what moves (--masks), or prepare the frames before and after "
-    "apart from each other."
-)
 
 
 @dataclass(frozen=True)
@@ -55,6 +51,16 @@ class Verdict:
     grade: Grade
     says: str = ""
     """Why, in sentences, the most severe first; empty if it is right."""
+
+
+def remedy(cameras: int, is_sequence: bool, is_given: bool) -> str:
+    """What may help a capture of so many cameras, whose intrinsics may be given already."""
+    ways = ["give --focal (and --lens) if you know them"] if cameras == 1 and not is_given else []
+    ways += ["try --lens radial, as each lens is known from few images"] if cameras > 1 and not is_given else []
+    ways += ["mask what moves (--masks)"]
+    ways += ["prepare the frames before and after apart" if is_sequence else "add images that overlap more"]
+    text = "; or ".join(ways)
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def worse(value: float, limits: tuple[float, float]) -> Grade:
@@ -136,8 +142,11 @@ def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
     return problems
 
 
-def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool) -> Verdict:
-    """The verdict on the chosen model, given those of the other mapper and from other focal lengths.
+def judge_together(
+    chosen: Witness, others: Sequence[Witness], is_sequence: bool, before: Witness | None = None
+) -> Verdict:
+    """The verdict on the chosen model, given those of the other mapper and from other focal lengths; ``before`` is the
+    chosen one without what was done to it alone, so that like is compared with like.
 
     A different track makes it doubtful unless that one can be dismissed: by its own evidence, or because a third track
     agrees with the chosen one, which fits more matches. If two mappers found the same track independently, doubtful
@@ -146,7 +155,11 @@ def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool
     alone = judge_alone(chosen, is_sequence)
     if chosen.only_turns and alone.grade != "broken":
         return Verdict("doubtful", f"{TURNS} {alone.says}".strip())
-    compared = [(other, d) for other in others if (d := agreement(chosen, other)) is not None]
+    compared = []
+    for other in others:
+        differences = [d for w in (before or chosen, chosen) if (d := agreement(w, other)) is not None]
+        if differences:
+            compared.append((other, next((d for d in differences if d.is_same), differences[0])))
     is_confirmed = any(d.is_same and other.name != chosen.name for other, d in compared)
     against = [
         (other, d)

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.blending import blended_optical_depth, log_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
-from mmpi_ns.ops.blending import blended_optical_depth, log_shares
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.march import Rays

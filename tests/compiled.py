@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import march
+from mmpi_ns.sampler import march
 
 
 @pytest.fixture(autouse=True)

@@ -13,11 +13,11 @@ import torch
 from hand_made import random_mpi, unit
 from nerfstudio.cameras.rays import RayBundle
 
+from mmpi_ns.blending import blended_optical_depth
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights, render_colors
-from mmpi_ns.ops.march import MarchOptions, march
-from mmpi_ns.rendering.rendered import rays_of
+from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.sampler import march, rays_of
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 

@@ -9,8 +9,8 @@ import torch
 from random_fields import OracleRay, _places, _table, bundle, random_field, random_rays
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import MarchOptions, show_rays
-from mmpi_ns.rendering.sampler import rays_of
+from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.sampler import rays_of, show_rays
 
 
 def shown(field, rays, threshold=0.0, blends=False, **chosen):

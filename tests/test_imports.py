@@ -12,7 +12,10 @@ import pytest
 import mmpi_ns
 
 ROOT = Path(mmpi_ns.__file__).parent
-METHOD = ["utils", "scene", "ops", "placement", "data", "field", "rendering", "training", "model", "config"]
+METHOD = [
+    *("utils", "scene", "ops", "heads", "blending", "sampler"),
+    *("placement", "data", "field", "rendering", "training", "model", "config"),
+]
 """Each may import itself and what comes before it."""
 COMPANIONS = {
     "mmpi_priors": {"utils", "scene", "ops", "placement", "data"},
@@ -104,13 +107,21 @@ def test_only_triton_is_imported_within_a_function(name):
     assert [each for each in inner if "triton" not in each] == []
 
 
-def test_the_root_holds_the_model_the_registered_methods_and_the_functional_entry_alone():
-    assert {path.name for path in ROOT.glob("*.py")} == {"__init__.py", "config.py", "functional.py", "model.py"}
+def test_the_root_holds_the_method_and_the_functional_entry_alone():
+    assert {path.name for path in ROOT.glob("*.py")} == {
+        f"{name}.py" for name in ("__init__", "config", "model", "heads", "sampler", "blending", "functional")
+    }
 
 
 def test_importing_the_package_imports_nothing_large():
     """Torch takes seconds: it is imported when a function is first asked for."""
     code = "import sys, mmpi_ns; assert not {'torch', 'nerfstudio', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_importing_the_methods_reads_no_library_that_only_priors_or_scores_need():
+    """Every ns-* command imports them. OpenCV is among nerfstudio's own imports."""
+    code = "import sys, mmpi_ns.config; assert not {'scipy.signal', 'pycolmap', 'mmpi_priors'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

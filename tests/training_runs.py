@@ -122,7 +122,7 @@ def set_options(model, **settings):
 
 def schedule_of(training, steps, windows=1, **settings):
     """A schedule with the paper's settings, unless they are named."""
-    paper = {"blend_share": 0.25, "finetune_share": 0.0, "finetune_rate": 0.1, "decay_decades": 1.5, "decay_from": 0.0}
+    paper = {"blend_share": 0.25, "finetune_share": 0.0, "decay_decades": 1.5, "decay_from": 0.0}
     paper |= {"release_shares": ()}
     return make_schedule(ScheduleConfig(training, **(paper | settings)), steps, windows)
 

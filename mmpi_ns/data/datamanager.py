@@ -67,8 +67,6 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     _target: type = field(default_factory=lambda: MMPIDataManager)
     train_num_rays_per_batch: int = 4096
     """Pixel rays a training step."""
-    eval_num_rays_per_batch: int = 1024
-    """Rays of an evaluation batch during training."""
     priors: PriorsConfig = field(default_factory=PriorsConfig)
     """What the images tell beside their colours."""
     keypoint_rays: int = 384

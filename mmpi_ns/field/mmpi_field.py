@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from mmpi_ns.blending import log_shares
 from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
 from mmpi_ns.field.tables import Lookup, TexelTables
-from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
 from mmpi_ns.ops.dispatch import on_gpu
 from mmpi_ns.ops.gather import RaySums, Taps, gather_places, gather_taps
@@ -32,6 +32,9 @@ from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.visible_tiles import TrainingViews
 
+POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 2, 2
+"""Octaves of the positional encodings of NDC positions, where samples are shaded, and of directions."""
+
 
 @dataclass
 class ColourConfig:
@@ -44,16 +47,12 @@ class ColourConfig:
     Eight are half a cache line, so a CPU trains faster with them than with nine (docs/log/performance.md)."""
     hidden_width: int = 64
     """Width of the colour networks."""
-    position_frequencies: int = 2
-    """Shading of samples: octaves of the positional encoding of NDC positions."""
-    direction_frequencies: int = 2
-    """Octaves of the positional encoding of directions."""
 
     @property
     def sample_bytes(self) -> int:
         """What the network of one sample holds for its gradients: inputs, layers before and after their activation, and
         gradients of both. 0 where rays are shaded."""
-        inputs = self.feature_channels + 6 + 6 * (self.position_frequencies + self.direction_frequencies)
+        inputs = self.feature_channels + 6 + 6 * (POSITION_FREQUENCIES + DIRECTION_FREQUENCIES)
         return 4 * (2 * inputs + 6 * self.hidden_width) if self.shading == "sample" else 0
 
 
@@ -62,7 +61,9 @@ class MMPIField(TexelTables):
 
     Args:
         plan: frames and resolutions.
-        shading: with the next four, see ``ColourConfig``.
+        shading: with the next two, see ``ColourConfig``.
+        position_frequencies: octaves of the positional encoding of NDC positions, where samples are shaded.
+        direction_frequencies: octaves of the positional encoding of directions.
         shares_depth: K MPIs train jointly from the start, so each has 1/K of the optical depth.
         samples_per_voxel: samples along a ray per voxel side of the cube.
         cube_alpha: initial alpha of a cube sample.
@@ -77,8 +78,8 @@ class MMPIField(TexelTables):
         shading: Shading = "sample",
         feature_channels: int = 9,
         hidden_width: int = 64,
-        position_frequencies: int = 2,
-        direction_frequencies: int = 2,
+        position_frequencies: int = POSITION_FREQUENCIES,
+        direction_frequencies: int = DIRECTION_FREQUENCIES,
         shares_depth: bool = False,
         samples_per_voxel: float = 1.0,
         cube_alpha: float = 1e-3,

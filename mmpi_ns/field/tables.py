@@ -300,10 +300,8 @@ class TexelTables(Field):
                 return  # nerfstudio loads the pipeline's own, empty state in a second pass
             raise ValueError("The checkpoint holds no scene plan: it was not written by this method.")
         plan = ScenePlan.from_json(to_text(plan_bytes))
-        copied = bool(state_dict.get(prefix + "copied", False))
+        copied = bool(state_dict[prefix + "copied"])
         self.build(plan, float(state_dict[prefix + "texel_factor"]), state_dict[prefix + "tiles"], copied)
-        for name in ("copied", "gain"):  # not in older files
-            state_dict.setdefault(prefix + name, getattr(self, name))
         self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as it was written, whatever a plan has now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 

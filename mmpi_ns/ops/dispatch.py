@@ -12,6 +12,7 @@ import importlib
 import inspect
 import os
 import shutil
+import sys
 import sysconfig
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -58,11 +59,14 @@ class Operation(Generic[P, R]):
         compiled: tuple[Form, ...],
         check: Callable[..., None] | None,
         in_cpp: int | None,
+        kernels: str | None = None,
     ) -> None:
         functools.update_wrapper(self, reference)
         self.reference, self.compiled, self.check = reference, list(compiled), check
         self.name, self.signature = reference.__name__, inspect.signature(reference)
-        self.folder = Path(inspect.getfile(reference)).parents[1]
+        self.kernels = kernels or reference.__module__
+        """The module of its compiled forms, with ``gpu`` beside it."""
+        self.folder = Path(str(sys.modules[self.kernels].__file__)).parents[1]
         """Of the package's operations: one library."""
         OPERATIONS[self.name] = self
         if in_cpp is not None:
@@ -125,7 +129,10 @@ OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 
 def operation(
-    *compiled: Form, check: Callable[..., None] | None = None, in_cpp: int | None = None
+    *compiled: Form,
+    check: Callable[..., None] | None = None,
+    in_cpp: int | None = None,
+    kernels: str | None = None,
 ) -> Callable[[Callable[P, R]], Operation[P, R]]:
     """Makes an operation of a function.
 
@@ -134,8 +141,9 @@ def operation(
         check: takes the same arguments and raises what their annotations cannot say.
         in_cpp: the form for a CPU is ``mmpi_NAME`` in C++ (``Operation._in_cpp``); rows of its first result that are
             worth another thread, 0: one thread computes all.
+        kernels: module of the compiled forms, where it is not the definition's.
     """
-    return functools.partial(Operation, compiled=compiled, check=check, in_cpp=in_cpp)
+    return functools.partial(Operation, compiled=compiled, check=check, in_cpp=in_cpp, kernels=kernels)
 
 
 def on_gpu(x: Tensor) -> bool:
@@ -168,7 +176,7 @@ def form_of(name: str, *tensors: Tensor) -> Form:
 def function(name: str, form: Form) -> Any:
     """One form of an operation."""
     of = OPERATIONS[name]
-    return getattr(of, form) if form != "gpu" else getattr(importlib.import_module(f"{of.__module__}.gpu"), name)
+    return getattr(of, form) if form != "gpu" else getattr(importlib.import_module(f"{of.kernels}.gpu"), name)
 
 
 def choose(path: Route) -> None:

@@ -1,8 +1,8 @@
-"""Candidates for MPIs and the cube: a generous list, from which ``rule.py`` chooses.
+"""Candidates for MPIs: a generous list, from which ``rule.py`` chooses.
 
-Two kinds. *Views* are frusta of training cameras, some pulled back, some widened: seen from its own origin an MPI has
-no plane error and texels as fine as pixels. *Cubes* surround what the cameras look at from all round. (MPIs that face
-left, right, up or down at a camera were candidates too, and measured worse: docs/log/experiments.md.)
+They are frusta of training cameras, some pulled back, some widened: seen from its own origin an MPI has no plane error
+and texels as fine as pixels. (MPIs that face left, right, up or down at a camera, and cubes around what cameras look at
+from all round, were candidates too, and measured worse.)
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.errors import cube_errors, pixel_slopes
+from mmpi_ns.placement.errors import pixel_slopes
 from mmpi_ns.placement.observations import Array, Observations, VisiblePoints, farthest_first
-from mmpi_ns.scene.plan import CubePlan, MPIPlan, Vector
+from mmpi_ns.scene.plan import MPIPlan, Vector
 from mmpi_ns.utils.errors import InputError
 
 MAX_VIEWS, MAX_WIDE_VIEWS = 96, 32
@@ -31,8 +31,6 @@ PULL_BACKS = (0.0, 1.0, 2.0)
 """Distances of an MPI behind its camera, relative to where points start."""
 NEAR_SHARE = 0.6
 """First plane, relative to where points start."""
-CUBE_SIZES = (0.4, 0.7, 1.0)
-"""Half a cube's side, relative to the cameras' distance from what they look at."""
 
 
 def vector(v: Array) -> Vector:
@@ -55,30 +53,27 @@ def facing_axes(base: Array, name: str) -> tuple[Vector, Vector, Vector]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A candidate MPI or cube of any resolution, and its expected errors."""
+    """A candidate MPI of any resolution, and its expected errors."""
 
-    frame: MPIPlan | CubePlan
+    frame: MPIPlan
     """Pose and extent; its planes and texels are not set yet."""
     rows: float
-    """Rows (of a cube: voxels a side) if a texel spans one pixel, seen from where the MPI stands."""
+    """Rows if a texel spans one pixel, seen from where the MPI stands."""
     columns: float
     plane: NDArray[np.float32]
     """[Q] e_p of each observation with two planes, in pixels: with L planes it is plane / (L - 1)."""
     texel: NDArray[np.float32]
     """[Q] e_t of each observation, relative to the pixels of a texel; inf if the candidate does not contain it."""
 
-    def at(self, texel_pixels: float, planes: int, max_voxels: int) -> MPIPlan | CubePlan:
-        """The MPI or cube with texels of this many pixels."""
-        if isinstance(self.frame, CubePlan):
-            side = int(np.clip(round(self.rows / texel_pixels), 8, max_voxels))
-            return replace(self.frame, shape=(side, side, side))
+    def at(self, texel_pixels: float, planes: int) -> MPIPlan:
+        """The MPI with texels of this many pixels."""
         height, width = (max(8, round(n / texel_pixels) + 1) for n in (self.rows, self.columns))
         return replace(self.frame, planes=planes, height=height, width=width)
 
 
-def find_candidates(observations: Observations, visible: VisiblePoints, with_cubes: bool) -> list[Candidate]:
-    """Views of training cameras that are spread over the capture, and cubes. Raises InputError if no camera has a field
-    of view that an MPI can have."""
+def find_candidates(observations: Observations, visible: VisiblePoints) -> list[Candidate]:
+    """Views of training cameras that are spread over the capture. Raises InputError if no camera has a field of view
+    that an MPI can have."""
     centers, back = observations.centers / max(visible.near, 1e-12), observations.camera_to_worlds[:, :, 2]
     places = np.concatenate([centers, back * 2], -1)
     most, candidates = MAX_WIDE_VIEWS if observations.wide.any() else MAX_VIEWS, []
@@ -104,7 +99,7 @@ def find_candidates(observations: Observations, visible: VisiblePoints, with_cub
         raise InputError(
             "No MPI fits the field of view of any training camera: check camera_model, focal lengths and distortion."
         )
-    return [*candidates, *(_cubes(observations, visible) if with_cubes else [])]
+    return candidates
 
 
 def _faces(observations: Observations, i: int) -> Iterator[tuple[str, Array, Array, Array]]:
@@ -132,29 +127,3 @@ def _widened(u: Array, v: Array, margin: float) -> tuple[float, float, float, fl
     """A frustum's tangents (u0, u1, v0, v1), ``margin`` times as wide and high about its middle."""
     u0, u1, v0, v1 = (float(x) for side in (u, v) for x in side.mean() + margin * (side - side.mean()))
     return u0, u1, v0, v1
-
-
-def _cubes(observations: Observations, visible: VisiblePoints) -> Iterator[Candidate]:
-    """Cubes around the point nearest to all viewing axes; none if most cameras do not face it.
-
-    Their voxels span the number of pixels asked for in the median over the observations inside.
-    """
-    forward = -observations.camera_to_worlds[:, :, 2]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    total = across.sum(0)
-    if np.linalg.cond(total) > 1e4:  # all look the same way
-        return
-    center = np.linalg.solve(total, np.einsum("mij,mj->i", across, observations.centers))
-    offset = center - observations.centers
-    distances = np.linalg.norm(offset, axis=-1)
-    if np.mean(np.einsum("mi,mi->m", offset, forward) > 0.8 * distances) < 0.8:
-        return
-    for half in (size * float(np.median(distances)) for size in CUBE_SIZES):
-        frame = CubePlan(vector(center - half), vector(center + half), (2, 2, 2))
-        # A voxel as large as half the cube spans this many pixels.
-        pixels = cube_errors(frame, observations, visible.cameras, visible.points)
-        inside = np.isfinite(pixels)
-        if inside.any():
-            side = 2 * float(np.median(pixels[inside]))
-            plane = np.where(inside, 0.0, np.inf).astype(np.float32)
-            yield Candidate(frame, side, side, plane, (2 * pixels / side).astype(np.float32))

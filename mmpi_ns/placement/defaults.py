@@ -42,10 +42,10 @@ RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),
     **dict.fromkeys(("planes", "max_planes"), Number(2, MOST_PLANES, whole=True)),
     **dict.fromkeys(("height", "width"), Number(2, MOST_TEXELS, whole=True)),
-    **dict.fromkeys(("max_voxels", "cube_voxels"), Number(0, MOST_VOXELS, whole=True)),
-    **dict.fromkeys(("plane_pixels", "texel_pixels", "enough"), POSITIVE),
-    **dict.fromkeys(("max_texels", "rays_per_texel", "texels_per_ray"), NOT_NEGATIVE),
-    **dict.fromkeys(("min_gain", "window_length", "drive_pull_back"), NOT_NEGATIVE),
+    "cube_voxels": Number(0, MOST_VOXELS, whole=True),
+    **dict.fromkeys(("plane_pixels", "texel_pixels"), POSITIVE),
+    **dict.fromkeys(("max_texels", "rays_per_texel"), NOT_NEGATIVE),
+    **dict.fromkeys(("min_gain", "window_length"), NOT_NEGATIVE),
 }
 FACES = ("front", "left", "right", "below")
 

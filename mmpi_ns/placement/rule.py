@@ -31,6 +31,12 @@ BEYOND = 0.05
 """Margin around an image that should have texels, as a fraction of its sides, because other views look there."""
 WIDEST, FARTHEST = 3.0, 0.5
 """Limits on widened tangents, absolute and relative: a border far from all MPIs would cost too much."""
+ENOUGH = 0.85
+"""Expected error that needs no further MPI, relative to a texel's pixels."""
+TEXELS_PER_RAY = 8.0
+"""Maximum texels for each training ray, in total: more would overfit."""
+DRIVE_PULL_BACK = 0.45
+"""Distance of the front MPI of a drive behind the first camera, as a fraction of the travel."""
 OVERLAPPING = 1.25
 """Half the extent of each MPI of a room, a tangent: above 1 neighbours overlap."""
 
@@ -58,22 +64,14 @@ class PlacementConfig:
     rays_per_texel: float = 5.0
     """Training rays that meet the footprint of a texel, of all images that see it: a short run on large images that
     overlap little gets larger texels (automatic)."""
-    texels_per_ray: float = 8.0
-    """Maximum texels for each training ray, in total: more would overfit; 0: no limit (automatic)."""
     height: int = 96
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
     """Texel columns of every MPI (drive, room)."""
-    enough: float = 0.85
-    """Expected error that needs no further MPI, relative to a texel's pixels (automatic)."""
-    max_voxels: int = 0
-    """Maximum voxels along a side of a cube, if it lowers the expected error; 0: no cube (automatic)."""
     window_length: float = 5.0
     """Longer captures are split into windows of this length, in median distances of the content; 0: never."""
     faces: tuple[str, ...] = ("front", "left", "right", "below")
     """Which MPIs of the drive to use (drive)."""
-    drive_pull_back: float = 0.45
-    """Distance of the front MPI behind the first camera, as a fraction of the travel (drive)."""
     cube_voxels: int = 0
     """Voxels along each side of the centred cube; 0 for none (room)."""
 
@@ -90,7 +88,7 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
         centers = observations.centers @ base.T
         start = np.array([centers[:, 0].mean(), centers[:, 1].mean(), centers[:, 2].min()])
         travel = float(np.ptp(centers[:, 2])) / metre
-        back = config.drive_pull_back * travel
+        back = DRIVE_PULL_BACK * travel
         # origin (right, down, forward) in metres from the first camera, near, tangents along the MPI's own x and y
         rule = {
             "front": ((0.0, 0.0, -back), back + 3, (-1.0, 1.0, -0.35, 0.35)),
@@ -107,8 +105,6 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     trainable, budget = texel_limits(observations, visible, config, training_rays)
     finest = max(config.texel_pixels, trainable)
     chosen, texel_pixels = _choose(observations, visible, replace(config, max_texels=budget), finest)
-    mpis = tuple(h for h in chosen if isinstance(h, MPIPlan))
-    cube = next((h for h in chosen if isinstance(h, CubePlan)), None)
     detail = 1.0
     if texel_pixels > finest and budget != config.max_texels:
         remedy = "more steps"
@@ -118,8 +114,8 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     else:
         remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
-    mpis = tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))  # two may be placed at one camera
-    return ScenePlan(mpis, cube, 0.2 * visible.near, visible.near, origin, detail)
+    mpis = tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(chosen))  # two may be placed at one camera
+    return ScenePlan(mpis, None, 0.2 * visible.near, visible.near, origin, detail)
 
 
 def _room(observations: Observations, content_near: float, config: PlacementConfig) -> ScenePlan:
@@ -140,7 +136,7 @@ def texel_limits(
 ) -> tuple[float, float]:
     """Pixels that a texel must span to meet ``rays_per_texel`` of the training's rays (0 if these are not known), and
     texels in all that the settings and these rays allow (0 for any number)."""
-    limits = [config.max_texels, config.texels_per_ray * (training_rays or 0)]
+    limits = [config.max_texels, TEXELS_PER_RAY * (training_rays or 0)]
     budget = min((limit for limit in limits if limit > 0), default=0.0)
     if training_rays is None:
         return 0.0, budget
@@ -150,18 +146,16 @@ def texel_limits(
 
 def _choose(
     observations: Observations, visible: VisiblePoints, config: PlacementConfig, finest: float
-) -> tuple[list[MPIPlan | CubePlan], float]:
-    """The heads for a scene, with texels no finer than the budget allows, and the pixels that a texel spans."""
-    candidates = find_candidates(observations, visible, with_cubes=config.max_voxels > 0)
+) -> tuple[list[MPIPlan], float]:
+    """The MPIs for a scene, with texels no finer than the budget allows, and the pixels that a texel spans."""
+    candidates = find_candidates(observations, visible)
 
-    def heads_at(choice: _Choice, size: float) -> tuple[list[MPIPlan | CubePlan], float]:
+    def heads_at(choice: _Choice, size: float) -> tuple[list[MPIPlan], float]:
         """Heads, and the share of the budget that they use."""
-        heads = choice.heads(size)
-        mpis = widened([h for h in heads if isinstance(h, MPIPlan)], observations, visible)
-        heads = [*mpis, *(h for h in heads if isinstance(h, CubePlan))]
+        heads = widened(choice.heads(size), observations, visible)
         return heads, sum(h.texels for h in heads) / config.max_texels if config.max_texels else 0.0
 
-    tried: list[tuple[_Choice, float, list[MPIPlan | CubePlan], float]] = []
+    tried: list[tuple[_Choice, float, list[MPIPlan], float]] = []
     too_fine, texel_pixels = None, finest
     for _ in range(BUDGET_ROUNDS):
         choice = _Choice(candidates, visible.weights, config, texel_pixels)
@@ -193,22 +187,19 @@ class _Choice:
         self, candidates: list[Candidate], weights: NDArray[np.float64], config: PlacementConfig, texel_pixels: float
     ) -> None:
         self.candidates, self.weights, self.config = candidates, weights, config
-        # Of each observation if a candidate serves it: log2 of the expected pixel error over ``enough``.
-        enough, cost = config.enough * texel_pixels, []
+        # Of each observation if a candidate serves it: log2 of the expected pixel error over ``ENOUGH``.
+        enough, cost = ENOUGH * texel_pixels, []
         for c in candidates:
-            # A cube may not have enough voxels for texels as fine.
-            size = max(texel_pixels, c.rows / config.max_voxels) if isinstance(c.frame, CubePlan) else texel_pixels
-            error = np.hypot(c.plane / (config.max_planes - 1), 0.5 * size * c.texel)
+            error = np.hypot(c.plane / (config.max_planes - 1), 0.5 * texel_pixels * c.texel)
             cost.append(np.log2(np.clip(error, enough, max(WORST, 2 * enough)) / enough).astype(np.float32))
         self.cost: NDArray[np.float32] = np.stack(cost)
         self.nothing = np.full(self.cost.shape[1], self.cost.max(), np.float32)
-        texels = [c.at(texel_pixels, config.max_planes, config.max_voxels).texels for c in candidates]
+        texels = [c.at(texel_pixels, config.max_planes).texels for c in candidates]
         self.texels = np.array(texels, dtype=np.float64)
         self.price = np.sqrt(self.texels)  # by which the gain of a candidate is divided
-        self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
         self.chosen = self._choose()
 
-    def heads(self, texel_pixels: float) -> list[MPIPlan | CubePlan]:
+    def heads(self, texel_pixels: float) -> list[MPIPlan]:
         """The chosen heads with texels of a size, each MPI with the planes it needs."""
         config, owner, heads = self.config, self.cost[self.chosen].argmin(0), []
         for n, candidate in enumerate(self.candidates[j] for j in self.chosen):
@@ -217,36 +208,33 @@ class _Choice:
             error = error[np.isfinite(error)]
             steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * texel_pixels) if len(error) else 0.0
             planes = int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, config.max_planes))
-            heads.append(candidate.at(texel_pixels, planes, config.max_voxels))
+            heads.append(candidate.at(texel_pixels, planes))
         return heads
 
     def _choose(self) -> list[int]:
         """Adds, one by one, the candidate with the largest gain for its texels, until none gains enough."""
         # A scene needs an MPI, however little it gains.
         gain = np.maximum(self.nothing - self.cost, 0) @ self.weights
-        chosen = [int(np.where(self.is_cube, -1.0, gain / self.price).argmax())]
+        chosen = [int((gain / self.price).argmax())]
         while len(chosen) < self.config.max_mpis:
             more = np.maximum(np.minimum(self.nothing, self.cost[chosen].min(0)) - self.cost, 0) @ self.weights
             allowed = more >= self.config.min_gain
-            if self.is_cube[chosen].any():
-                allowed &= ~self.is_cube
             if not allowed.any():
                 break
             best = int(np.where(allowed, more / self.price, -1.0).argmax())
             grown = [*chosen, best]
             while True:  # without the heads whose absence costs less than the minimum gain, one by one
-                total, mpis = self._total(grown), int((~self.is_cube[grown]).sum())
+                total = self._total(grown)
                 losses = [self._total([c for c in grown if c != j]) - total for j in grown]
-                free = [n for n, j in enumerate(grown) if self.is_cube[j] or mpis > 1]
-                least = min(free, key=losses.__getitem__, default=None)
-                if least is None or losses[least] >= self.config.min_gain:
+                least = int(np.argmin(losses))
+                if len(grown) == 1 or losses[least] >= self.config.min_gain:
                     break
                 del grown[least]
             if self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
                 break
             chosen = grown
         # The first is chosen for its texels, and further ones may only make up for it: one of as many may do alone.
-        affordable = (self.texels <= self.texels[chosen].sum()) & ~self.is_cube
+        affordable = self.texels <= self.texels[chosen].sum()
         alone = [int(np.where(affordable, gain, -1.0).argmax())]
         spared = self.config.min_gain * (len(chosen) - 1)
         return alone if self._total(alone) <= self._total(chosen) + spared else chosen

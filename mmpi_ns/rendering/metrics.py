@@ -11,7 +11,6 @@ from nerfstudio.utils.colormaps import apply_float_colormap
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.nn.functional import pad
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 MOST_SORTED = 1 << 20
 """Pixels used for the brightness range of a depth image; torch computes quantiles of at most 16.7 M."""
@@ -68,6 +67,8 @@ def psnr(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> f
 
 def ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> float:
     """Mean structural similarity of the windows about all pixels of two images in [0, 1], mirrored at their borders."""
+    from torchmetrics.functional.image import structural_similarity_index_measure  # imports scipy.signal: seconds
+
     height, width = predicted.shape[:2]
     rows, total, border = max(1, PART // width), 0.0, WINDOW // 2
     images = [torch.moveaxis(x, -1, 0)[None].float() for x in (predicted, observed)]

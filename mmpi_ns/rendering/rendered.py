@@ -11,20 +11,19 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
+from mmpi_ns.blending import blended_optical_depth
 from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.field.tables import Lookup
-from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import Composite, composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.gather import RaySums
-from mmpi_ns.ops.march import MarchOptions, MergedSamples, show_rays
-from mmpi_ns.rendering.sampler import MMPISampler, rays_of
+from mmpi_ns.ops.march import MarchOptions, MergedSamples
+from mmpi_ns.sampler import march, rays_of, show_rays
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
 """Grey levels of backgrounds by name."""
-SAMPLER = MMPISampler()
 
 
 def background_of(name: str, like: Tensor) -> Tensor:
@@ -124,7 +123,8 @@ def render_rays(
         head_mask: heads that may render each ray; None for all.
         choose: priorities; each ray is rendered by the MPI of highest priority among those it meets (and the cube).
     """
-    samples = SAMPLER(bundle, field, options, head_mask, choose)
+    with torch.no_grad():
+        samples = march(field.layout, field.tables, rays_of(bundle, head_mask, choose), options)
     tau, lookup = samples.tau, None
     if torch.is_grad_enabled():
         tau, lookup = field.get_density(bundle, samples)

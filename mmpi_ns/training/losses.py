@@ -22,6 +22,8 @@ PLANE_ERROR = 0.6
 """Minimum error of a known depth, in spacings of the densest planes."""
 TV_EVERY = 4
 """Total variation is added every this many steps, with its weight multiplied by the same number."""
+DEPTH_OUTLIERS = 0.02
+"""Likelihood of a known depth where a ray has no weight: the larger, the less influence false depths have."""
 KEYPOINT_WIDTH, KEYPOINT_OUTLIERS = 0.06, 1e-4
 """Standard deviation of the window round an SfM keypoint, relative to its inverse distance, and likelihood of a false
 one. Its mean is over the keypoint rays that can reach their point."""
@@ -42,8 +44,6 @@ class LossWeights:
     depth_priors: float = 0.01
     """-log of the likelihood of a pixel's known depth, from dense matches, an SfM point or a sensor. Falls with the
     learning rates: in the end colours are more accurate."""
-    depth_outliers: float = 0.02
-    """Likelihood of a known depth where a ray has no weight: the larger, the less influence false depths have."""
     tv_density: float = 1e-4
     """Total variation of the densities, in DVGO's normalisation (there: 1e-5)."""
     tv_features: float = 1e-5
@@ -161,7 +161,7 @@ def batch_losses(
         )
     if told.disparities is not None and weight.depth_priors > 0:
         total["depth_priors"] = (weight.depth_priors * decay) * depth_priors(
-            sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers, max(1, len(pixels))
+            sums.mass.index_select(0, pixels), sums.reached[pixels], DEPTH_OUTLIERS, max(1, len(pixels))
         )
     if rays.lookup is not None and step % TV_EVERY == 0 and field.density.requires_grad:
         variation = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features, weight.tv_chroma)

@@ -54,7 +54,6 @@ RANGES = {
     "pipeline.model.schedule": {
         "blend_share": SHARE,
         "finetune_share": SHARE,
-        "finetune_rate": NOT_NEGATIVE,
         "decay_decades": NOT_NEGATIVE,
         "decay_from": SHARE,
         "growth_shares": SHARE,
@@ -62,15 +61,12 @@ RANGES = {
         "release_weight": NOT_NEGATIVE,
     },
     "pipeline.model.sampling": {
-        "samples_per_voxel": POSITIVE,
         "cube_alpha": Number(0, 1, above=True),
         "threshold": SHARE,
     },
     "pipeline.model.colour": {
         "feature_channels": Number(3, 256, whole=True),
         "hidden_width": Number(1, 4096, whole=True),
-        "position_frequencies": Number(0, 32, whole=True),
-        "direction_frequencies": Number(0, 32, whole=True),
     },
     "pipeline.model.rendering": {"threshold": SHARE, "resident_gib": NOT_NEGATIVE, "nearest_images": COUNT},
     "pipeline.model.loss": {f.name: NOT_NEGATIVE for f in fields(LossWeights)},

@@ -42,8 +42,6 @@ class ScheduleConfig:
     """Share of the steps in which only reliability trains."""
     finetune_share: float = 0.4
     """Share of the steps in which everything trains together at the end."""
-    finetune_rate: float = 1.0
-    """Learning rates at the start of the fine-tune relative to those of the first phase."""
     decay_decades: float = 1.0
     """Decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5),"""
     decay_from: float = 0.5
@@ -76,8 +74,6 @@ class Schedule:
     """Learning rates fall by 10^-decay_decades over the rest of a phase,"""
     decay_from: float
     """after being constant for this fraction of it."""
-    finetune_rate: float
-    """Learning rates at the start of the fine-tune, relative to those of the first phase."""
     windows: int = 1
     """Windows of a long capture, which follow this schedule one after the other."""
     release: tuple[int, ...] = ()
@@ -150,8 +146,7 @@ class Schedule:
     def rate_factor(self, kind: str, step: int) -> float:
         """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""
         phase = self.phase_at(step)
-        base = self.finetune_rate if phase.name == "finetune" else 1.0
-        return base * self.decay(step) if kind in TRAINS[phase.name] else 0.0
+        return self.decay(step) if kind in TRAINS[phase.name] else 0.0
 
     def decay(self, step: int) -> float:
         """What rates have fallen to at a step, relative to the start of its phase."""
@@ -168,7 +163,6 @@ class Schedule:
         data = json.loads(text)
         phases = tuple(Phase(**p) for p in data.pop("phases"))
         lists = {name: tuple(data.pop(name, ())) for name in ("growth", "release")}
-        data.pop("growing_rays", None)  # of older runs
         return Schedule(phases=phases, **lists, **data)
 
 
@@ -197,7 +191,7 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, de
     first = phases[0].end
     doublings = {s: s / SOONER if depths_known else s for s in config.growth_shares}
     growth = tuple(max(1, round(s * first)) for s in doublings.values())
-    rates = float(config.decay_decades), float(config.decay_from), float(config.finetune_rate)
+    rates = float(config.decay_decades), float(config.decay_from)
     share = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if depths_known else 1.0
     schedule = Schedule(phases, growth, *rates, windows, growing_share=share)
     release = (

@@ -119,7 +119,3 @@ class TouchedAdamConfig(OptimizerConfig):
     _target: type = TouchedAdam
     lr: float = 0.1
     """Learning rate at the start of the group's phase."""
-    betas: tuple[float, float] = (0.9, 0.99)
-    """Decay of the first and second moment."""
-    eps: float = 1e-8
-    """Keeps the update finite where the second moment is zero."""

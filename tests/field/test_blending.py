@@ -1,4 +1,4 @@
-"""Shares of the heads and what they leave of a sample's optical depth (ops/blending.py, paper sec. III-C)."""
+"""Shares of the heads and what they leave of a sample's optical depth (blending.py, paper sec. III-C)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import torch
 from hand_made import random_votes, tensor
 
-from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
+from mmpi_ns.blending import blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights
 
 F64 = torch.float64

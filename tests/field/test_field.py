@@ -11,9 +11,9 @@ from hand_made import make_mpi
 from random_fields import bundle, fill, random_field, random_plan, random_rays, render, sampled
 from random_scenes import dense_grad
 
+from mmpi_ns.blending import log_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import in_half_precision
-from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.scene.geometry import LocalRays
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 

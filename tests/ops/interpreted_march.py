@@ -18,8 +18,8 @@ from random_scenes import dense_grad
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import blending, composite
 from mmpi_ns.ops.interpolate import Table
-from mmpi_ns.ops.march import MarchOptions, gpu, march
-from mmpi_ns.rendering.sampler import rays_of
+from mmpi_ns.ops.march import MarchOptions, gpu
+from mmpi_ns.sampler import march, rays_of
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 # Crossings -----------------------------------------------------------------------------------------------------------
@@ -122,7 +122,7 @@ def compare(field, rays, threshold, blends=False, **chosen):
 @pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("threshold", [0.0, 1e-2])
 def test_the_march_keeps_what_the_reference_keeps(monkeypatch, blends, threshold):
-    monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
     field = random_field(3, True, seed=3, planes=14)
     _, plain = compare(field, bundle(*random_rays(field.plan, 40, seed=1)), threshold, blends)
     valid = plain.samples.valid
@@ -169,7 +169,7 @@ def test_rays_render_as_the_oracle_has_them():
 @pytest.mark.parametrize("raw", [0.0, 1e4, -1e4])
 def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monkeypatch, raw):
     """Two MPIs coincide, so that every distance is a tie; raw densities make alpha 1 or 0."""
-    monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)
     field = MMPIField(hard_plan(), feature_channels=5, hidden_width=6)
     field.reliability.data.normal_(generator=torch.Generator().manual_seed(1))
     field.density.data.fill_(raw)
@@ -237,7 +237,7 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
 
 
 def test_a_field_of_trained_and_untrained_texels_blends_like_the_reference(monkeypatch):
-    monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)
     field = fill(MMPIField(random_field(3, True, seed=11).plan, feature_channels=5, hidden_width=6), 11)
     field.touched.copy_(torch.rand(len(field.touched), generator=torch.Generator().manual_seed(1)) < 0.5)
     compare(field, bundle(*random_rays(field.plan, 40, seed=2)), 1e-3, True)

@@ -16,7 +16,7 @@ from mmpi_ns.ops.march import gpu
 @pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("threshold", [0.0, 1e-2])
 def test_rays_show_what_the_reference_says(monkeypatch, blends, threshold):
-    monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
     field = random_field(3, True, seed=3, planes=14)
     wanted = compare(field, bundle(*random_rays(field.plan, 40, seed=1)), threshold, blends)
     assert len(wanted.winner.unique()) > 2 and wanted.gathered.abs().amax(0).min() > 0.05

@@ -7,7 +7,7 @@ import torch
 from gpu_parts import interpret
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import march
+from mmpi_ns.sampler import march
 
 
 @pytest.fixture(autouse=True)

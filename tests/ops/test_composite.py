@@ -12,7 +12,7 @@ from hand_made import tensor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
+from mmpi_ns.blending import blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights, exclusive_cumsum, median_inverse_distance, render_colors
 
 F64 = torch.float64

@@ -12,7 +12,8 @@ from compiled import compiled  # noqa: F401
 from hand_made import make_mpi, random_mpi
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.march import MarchOptions, Rays, march
+from mmpi_ns.ops.march import MarchOptions, Rays
+from mmpi_ns.sampler import march
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.geometry import Frames, inverse_distance, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan

@@ -13,7 +13,8 @@ from random_bricks import random_window, rays_into
 from torch import Tensor
 
 from mmpi_ns.ops.layout import Tables, check_shapes
-from mmpi_ns.ops.march import MarchOptions, Rays, march, show_rays
+from mmpi_ns.ops.march import MarchOptions, Rays
+from mmpi_ns.sampler import march, show_rays
 from mmpi_show.ops.baked import show_baked
 
 

@@ -21,7 +21,7 @@ from mmpi_ns.scene.plan import ScenePlan
 @pytest.fixture(autouse=True)
 def side_by_side(monkeypatch):
     assert dispatch.form_of("show_rays", torch.zeros(1)) == "cpu"
-    monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
 
 
 @pytest.mark.parametrize("blends", [True, False])

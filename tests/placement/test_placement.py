@@ -113,7 +113,7 @@ def test_still_cameras_side_by_side_get_one_mpi():
 def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
     observations = street()
     pixels = int(observations.sizes.prod(-1).sum())
-    config = PlacementConfig(texels_per_ray=0, max_texels=0)
+    config = PlacementConfig(max_texels=0)
     fine, enough, short = (place(observations, config, rays) for rays in (None, 10 * pixels, pixels // 10))
     assert [m.width for m in enough.mpis] == [m.width for m in fine.mpis]
     tangents = short.mpis[0].extent[1] - short.mpis[0].extent[0]

@@ -16,7 +16,7 @@ from mmpi_ns.placement.candidates import Candidate, find_candidates
 from mmpi_ns.placement.errors import PixelErrors, cube_errors, mpi_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
 from mmpi_ns.placement.rule import PlacementConfig, _Choice, place
-from mmpi_ns.scene.plan import CubePlan, MPIPlan
+from mmpi_ns.scene.plan import CubePlan
 
 
 def test_content_starts_for_each_camera_where_its_own_points_do():
@@ -52,7 +52,7 @@ def test_planes_begin_a_little_before_the_content_of_the_camera_or_of_all_where_
     observations = observed([[0.0, 0, 0], [30, 0, 0]], [[0, 0, -d] for d in depths], np.repeat([0, 1], 40))
     visible = find_visible_points(observations)
     assert visible.near == 55
-    found = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, visible, False)}
+    found = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, visible)}
     assert found == pytest.approx({
         ("view 1", 0.0): 6, ("view 1", 55.0): 61, ("view 1", 110.0): 116,
         ("view 2", 0.0): 33, ("view 2", 55.0): 88, ("view 2", 110.0): 143,
@@ -63,7 +63,7 @@ def test_candidates_start_from_cameras_far_apart_in_direction_too(monkeypatch):
     turns = turned_about_y(np.radians(45 * np.arange(8)))
     observations = observed(np.zeros((8, 3)), turns=turns)
     monkeypatch.setattr(candidates_module, "MAX_VIEWS", 4)
-    names = {c.frame.name for c in find_candidates(observations, find_visible_points(observations), False)}
+    names = {c.frame.name for c in find_candidates(observations, find_visible_points(observations))}
     assert np.diff(sorted(int(name.split()[1]) for name in names)).tolist() == [2, 2, 2]
 
 
@@ -76,46 +76,22 @@ def orbit(inwards: int = 16) -> Observations:
     return observed(centers, points, np.repeat(np.arange(inwards), 40), np.tile(np.arange(40), inwards), turns)
 
 
-def test_cubes_stand_where_the_cameras_look_and_nowhere_if_many_look_elsewhere():
-    def cubes(observations):
-        found = find_candidates(observations, find_visible_points(observations), with_cubes=True)
-        return [c.frame for c in found if isinstance(c.frame, CubePlan)]
-
-    found = cubes(orbit())
-    assert [c.upper[0] for c in found] == pytest.approx([1.6, 2.8, 4.0])
-    assert np.allclose(np.add([c.lower for c in found], [c.upper for c in found]), 0, atol=1e-9)
-    assert len(cubes(orbit(inwards=13))) == 3 and cubes(orbit(inwards=12)) == []
-
-
-def test_a_candidates_errors_are_those_of_the_mpi_or_cube_made_of_it():
+def test_a_candidates_errors_are_those_of_the_mpi_made_of_it():
     observations = orbit()
     visible = find_visible_points(observations)
-    candidates = find_candidates(observations, visible, with_cubes=True)
-    seen = {CubePlan: 0, MPIPlan: 0}
-    for candidate in candidates[::17] + candidates[-3:]:
-        head = candidate.at(0.5, 40, 10_000)
-        if isinstance(head, MPIPlan):
-            plane, texel = mpi_errors(head, observations, visible.cameras, visible.points)
-            assert (head.extent[1] - head.extent[0]) / (head.width - 1) == pytest.approx(0.5 / FX, rel=0.01)
-            assert (head.extent[3] - head.extent[2]) / (head.height - 1) == pytest.approx(0.5 / FY, rel=0.01)
-        else:
-            texel = cube_errors(head, observations, visible.cameras, visible.points)
-            plane = np.where(np.isfinite(texel), 0, np.inf)
+    candidates = find_candidates(observations, visible)
+    seen = 0
+    for candidate in candidates[::17]:
+        head = candidate.at(0.5, 40)
+        plane, texel = mpi_errors(head, observations, visible.cameras, visible.points)
+        assert (head.extent[1] - head.extent[0]) / (head.width - 1) == pytest.approx(0.5 / FX, rel=0.01)
+        assert (head.extent[3] - head.extent[2]) / (head.height - 1) == pytest.approx(0.5 / FY, rel=0.01)
         held = np.isfinite(texel)
         assert np.array_equal(np.isfinite(candidate.texel), held)
         assert candidate.plane[held] / 39 == pytest.approx(plane[held], rel=1e-4, abs=1e-6)
         assert 0.5 * candidate.texel[held] == pytest.approx(texel[held], rel=0.02)
-        seen[type(head)] += held.sum()
-    assert min(seen.values()) > 50
-
-
-def test_a_cube_costs_what_its_largest_grid_can_show():
-    cube = CubePlan((0.0,) * 3, (1.0,) * 3, (2, 2, 2))
-    frames = [Candidate(f, 400.0, 400.0, np.zeros(1, np.float32), np.ones(1, np.float32)) for f in (cube, mpi())]
-    assert [frames[0].at(size, 0, 100).texels for size in (1.0, 8.0)] == [100**3, 50**3]
-    config = PlacementConfig(max_voxels=100, enough=0.25)
-    costs = [_Choice(frames, np.ones(1), config, size).cost[:, 0] for size in (1.0, 4.0)]
-    assert costs[0].tolist() == [3, 1] and costs[1].tolist() == [1, 1]  # a texel of the cube spans 4 pixels at least
+        seen += held.sum()
+    assert seen > 50
 
 
 def test_texel_error_takes_the_worse_side_and_each_side_its_own_focal_length():
@@ -156,7 +132,7 @@ def candidate(texel, plane=None, rows=100.0, frame=None) -> Candidate:
 
 def chosen(candidates, weight=10.0, **changes):
     """The heads, with texels of two pixels, planes for one pixel, and so much weight for every observation."""
-    config = PlacementConfig(plane_pixels=0.5, texel_pixels=2.0, max_voxels=128, **changes)
+    config = PlacementConfig(plane_pixels=0.5, texel_pixels=2.0, **changes)
     return _Choice(candidates, np.full(len(candidates[0].texel), weight), config, 2.0).heads(2.0)
 
 
@@ -187,15 +163,6 @@ def test_of_two_that_show_as_much_the_one_with_fewer_texels_is_taken():
 
 def test_where_all_candidates_show_everything_well_enough_one_is_taken():
     assert [m.name for m in chosen([candidate(np.ones(4), frame=marked(0))] * 2)] == ["0"]
-
-
-def test_there_is_one_cube_at_most_and_never_a_cube_alone():
-    box = CubePlan((-1.0,) * 3, (1.0,) * 3, (2, 2, 2))
-    cubes = [candidate([1.0, 99, 99], frame=box), candidate([99.0, 1, 99], frame=box)]
-    found = chosen([*cubes, candidate([40.0, 40, 1])])
-    assert [type(h) for h in found].count(CubePlan) == 1 and len(found) == 2
-    alone = chosen([candidate(np.ones(3), frame=box), candidate([2.0, 2, 2])])
-    assert any(isinstance(h, MPIPlan) for h in alone)
 
 
 def test_one_that_does_alone_takes_the_place_of_a_small_first_one_and_its_helper():
@@ -234,12 +201,11 @@ def test_the_finest_texels_within_the_budget_are_kept_and_the_coarsest_where_non
 
 
 def test_texels_in_all_follow_the_settings_and_the_rays_whichever_allow_fewer():
-    config = PlacementConfig(max_texels=2000, texels_per_ray=8)
+    config = PlacementConfig(max_texels=2000)
     wanted = {None: 2000, 1000: 2000, 100: 800}
     scene = side_by_side(1), find_visible_points(side_by_side(1))
     assert {rays: rule.texel_limits(*scene, config, rays)[1] for rays in wanted} == wanted
     assert rule.texel_limits(*scene, replace(config, max_texels=0), 1000)[1] == 8000
-    assert rule.texel_limits(*scene, replace(config, texels_per_ray=0), 10)[1] == 2000
     assert rule.texel_limits(*scene, replace(config, max_texels=0), None)[1] == 0
 
 
@@ -291,12 +257,11 @@ def test_texels_are_as_fine_as_the_rays_of_all_images_that_see_them_train():
     [
         ({}, 10**9, "2.0 pixels: finer with a smaller placement.texel-pixels"),
         ({}, 2000, " pixels: finer with more steps"),
-        ({"texels_per_ray": 1}, 10**5, " pixels: finer with more steps"),
         ({"max_texels": 2e4}, 10**9, " pixels: finer with a larger placement.max-texels"),
     ],
 )
 def test_a_plan_says_how_large_texels_are_and_what_makes_them_finer(changes, rays, words):
-    config = replace(PlacementConfig(texel_pixels=2.0, texels_per_ray=0, max_texels=0), **changes)
+    config = replace(PlacementConfig(texel_pixels=2.0, max_texels=0), **changes)
     plan = place(side_by_side(4), config, rays)
     assert plan.origin_of_plan.startswith("automatic placement, a texel spans ") and words in plan.origin_of_plan
     numbers = [float(n) for n in re.findall(r"(?:spans|down to) ([\d.]+)", plan.origin_of_plan)]

@@ -11,14 +11,14 @@ from procedural import moved, observations_of
 from still_life import still_life
 
 from mmpi_ns.placement.candidates import find_candidates
-from mmpi_ns.placement.errors import WORST, cube_errors, mpi_errors
+from mmpi_ns.placement.errors import WORST, mpi_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points
-from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.scene.plan import CubePlan, ScenePlan
+from mmpi_ns.placement.rule import ENOUGH, PlacementConfig, place
+from mmpi_ns.scene.plan import ScenePlan
 from mmpi_scene.catalogue import make_scene
 
-CONFIG = PlacementConfig(max_texels=0, max_voxels=128)
-"""As fine as asked, and with cubes where they look worth it."""
+CONFIG = PlacementConfig(max_texels=0)
+"""As fine as asked."""
 
 
 def facing(plan: ScenePlan) -> np.ndarray:
@@ -39,44 +39,34 @@ def bits(plan: ScenePlan, observations: Observations, config: PlacementConfig = 
     """Expected error that a plan leaves, in bits, summed over images: the rule's own aim, worked out afresh."""
     visible = find_visible_points(observations)
     errors = [mpi_errors(m, observations, visible.cameras, visible.points) for m in plan.mpis]
-    if plan.cube is not None:
-        errors.append((np.zeros(1), cube_errors(plan.cube, observations, visible.cameras, visible.points)))
     least = np.min([np.hypot(plane, 0.5 * texel) for plane, texel in errors], axis=0)
-    enough = config.enough * config.texel_pixels
+    enough = ENOUGH * config.texel_pixels
     return float(np.log2(np.clip(least, enough, WORST) / enough) @ visible.weights)
 
 
-def test_a_forward_facing_grid_gets_one_mpi_and_no_cube():
+def test_a_forward_facing_grid_gets_one_mpi():
     plan = place(observations_of(still_life()), CONFIG)
-    assert len(plan.mpis) == 1 and plan.cube is None
+    assert len(plan.mpis) == 1
 
 
 def test_a_straight_street_gets_mpis_one_further_on_than_the_other_and_nothing_behind(street, street_plan):
     forward = street.mean_axes[2]
     places = np.array([m.origin for m in street_plan.mpis]) @ forward
     driven = np.ptp(street.centers @ forward)
-    assert street_plan.cube is None and 3 <= len(street_plan.mpis) <= 8
+    assert 3 <= len(street_plan.mpis) <= 8
     assert (facing(street_plan) @ forward > -0.2).all()
     assert np.ptp(places) > 0.4 * driven
 
 
-def test_looking_round_from_one_spot_gets_mpis_all_round_and_no_cube():
+def test_looking_round_from_one_spot_gets_mpis_all_round():
     observations = observations_of(make_scene("look-round"), per_camera=30)
     plan = place(observations, CONFIG)
     level = facing(plan)[:, :2]
     level = level[np.linalg.norm(level, axis=-1) > 0.5]
     azimuth = np.sort(np.degrees(np.arctan2(level[:, 1], level[:, 0])))
     gaps = np.diff(np.append(azimuth, azimuth[0] + 360))
-    assert plan.cube is None and len(plan.mpis) >= 5
+    assert len(plan.mpis) >= 5
     assert gaps.max() < 125  # an MPI is up to 90 degrees wide and the cameras' views overlap
-
-
-def test_cameras_round_an_object_get_a_cube_and_mpis_for_what_lies_behind_it():
-    plan = place(observations_of(make_scene("object"), per_camera=30), CONFIG)
-    assert plan.cube is not None and np.abs(np.add(plan.cube.lower, plan.cube.upper)[:2] / 2).max() < 0.3
-    assert len(plan.mpis) >= 3
-    without = place(observations_of(make_scene("object"), per_camera=30), replace(CONFIG, max_voxels=0))
-    assert without.cube is None and len(without.mpis) >= 5
 
 
 def test_mpis_grow_with_the_length_of_a_road():
@@ -168,9 +158,8 @@ def test_every_chosen_mpi_is_needed_and_no_other_would_add_enough(street, street
     finest = replace(street_plan, mpis=tuple(replace(m, planes=CONFIG.max_planes) for m in street_plan.mpis))
     floor = bits(finest, street)
     visible = find_visible_points(street)
-    for candidate in find_candidates(street, visible, with_cubes=False)[::7]:
-        mpi = candidate.at(CONFIG.texel_pixels, CONFIG.max_planes, CONFIG.max_voxels)
-        assert not isinstance(mpi, CubePlan)
+    for candidate in find_candidates(street, visible)[::7]:
+        mpi = candidate.at(CONFIG.texel_pixels, CONFIG.max_planes)
         assert bits(replace(finest, mpis=(*finest.mpis, mpi)), street) > floor - 1.1 * CONFIG.min_gain
 
 

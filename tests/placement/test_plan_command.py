@@ -83,7 +83,7 @@ def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch):
 
 def test_the_table_adds_up():
     observations = observations_of(make_scene("object"), per_camera=25)
-    plan = place(observations, PlacementConfig(max_texels=0, max_voxels=128))
+    plan = place(observations, PlacementConfig(arrangement="room", cube_voxels=32))
     report = explain(plan, observations, find_visible_points(observations))
     assert plan.cube is not None and len(report.shares) == len(plan.mpis) + 1
     assert report.shares.sum() + report.unserved == pytest.approx(1)

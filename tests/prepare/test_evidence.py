@@ -19,7 +19,7 @@ from mmpi_prepare.evidence import (
     strides,
     turns_explain,
 )
-from mmpi_prepare.verdict import best_first, judge_alone, judge_together
+from mmpi_prepare.verdict import best_first, judge_alone, judge_together, remedy
 
 POSES = drive()
 POINTS = scattered(POSES)
@@ -137,6 +137,16 @@ def test_two_mappers_of_one_mind_are_right_and_of_two_minds_doubtful(sound, keyp
     bent = replace(sound, poses=drive(turn=0.03), name="global", focal=0.7)
     verdict = judge_together(sound, [bent], True)
     assert verdict.grade == "doubtful" and "0.58 and 0.70 image sides" in verdict.says
+
+
+def test_the_chosen_track_is_compared_as_it_was_before_it_alone_was_adjusted(sound):
+    """Adjusting bends it a little; and what may help depends on the capture."""
+    adjusted = replace(sound, poses=drive(turn=0.03), name="global")
+    assert judge_together(adjusted, [sound], True).grade == "doubtful"
+    assert judge_together(adjusted, [sound], True, before=replace(sound, name="global")).grade == "right"
+    assert "--focal" in remedy(1, True, False) and "frames before" in remedy(1, True, False)
+    assert "--focal" not in remedy(10, False, False) and "frames" not in remedy(10, False, False)
+    assert remedy(1, False, True).startswith("Mask what moves")
 
 
 def test_a_broken_second_mapper_does_not_speak_against_a_right_one(sound, keypoints):

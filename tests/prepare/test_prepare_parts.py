@@ -16,7 +16,17 @@ from PIL import Image
 
 from mmpi_ns.utils.errors import InputError
 from mmpi_prepare import export, features, mapping
-from mmpi_prepare.adjustment import adjust, choose_frame, is_bent, polish, quality, similarity_between
+from mmpi_prepare.adjustment import (
+    adjust,
+    choose_frame,
+    fit_error,
+    is_bent,
+    polish,
+    quality,
+    similarity_between,
+    turns_back,
+    worth,
+)
 from mmpi_prepare.images import Photo, choose_frames, median_motion
 from mmpi_prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
 from mmpi_priors.sfm import rigid3d
@@ -278,9 +288,9 @@ def test_given_intrinsics_are_left_alone_and_others_refined():
 
 
 @pytest.mark.parametrize(("tangential", "kept"), [(0.0, "SIMPLE_RADIAL"), (0.02, "OPENCV")])
-def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential, kept, monkeypatch, capsys):
-    """Exact points seen through a known lens with noise of a third of a pixel, in a model with one radial term; lenses
-    whose pixels are not square are not believed."""
+def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential, kept, monkeypatch):
+    """Exact points seen through a known lens with noise of a third of a pixel, in a model with one radial term; pixels
+    stay square, and a camera of few images keeps one term."""
     random, true = np.random.default_rng(0), [300, 300, 100, 80, 0.1, 0.0, tangential, -tangential]
     lens = pycolmap.Camera(model="OPENCV", params=true, **SIZE)
     poses = corridor.poses(6, bend=0.15)
@@ -306,11 +316,22 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
         assert camera.params[6:] == pytest.approx(true[6:], abs=0.004)
         simple = polish(model, 1, lens=True, full_lens=False, principal_point=False)
         assert [c.model.name for c in simple.cameras.values()] == ["SIMPLE_RADIAL"]
-        assert "off square" not in capsys.readouterr().out
-        monkeypatch.setattr("mmpi_prepare.adjustment.SQUARE", 1e-4)
-        square = polish(model, 1, lens=True, full_lens=True, principal_point=False)
-        assert [c.model.name for c in square.cameras.values()] == ["SIMPLE_RADIAL"]
-        assert "not kept, as pixels would be" in capsys.readouterr().out
+        assert camera.params[0] == camera.params[1]
+        monkeypatch.setattr("mmpi_prepare.adjustment.IMAGES_OF_LENS", 7)
+        assert polish(model, 1, lens=True, full_lens=True, principal_point=False) is model
+
+
+def test_a_lens_that_cannot_be_is_named_and_more_terms_need_more_evidence():
+    """Terms of a tourist's photo; few keypoints and many cameras; one point that runs off."""
+    absurd = pycolmap.Camera(model="RADIAL", width=800, height=1200, params=[1000, 400, 600, 0.5, -10.8])
+    assert turns_back(absurd)
+    wide = pycolmap.Camera(model="OPENCV", width=800, height=1200, params=[700, 700, 400, 600, -0.3, 0.12, 0, 0])
+    assert not turns_back(wide)
+    few, many = (SimpleNamespace(compute_num_observations=lambda n=n: n) for n in (2_000, 100_000))
+    assert worth(few, 40) < 0.96 < worth(many, 4) == 0.97
+    points = {n: SimpleNamespace(error=0.5, track=SimpleNamespace(length=lambda: 4)) for n in range(99)}
+    points[99] = SimpleNamespace(error=np.inf, track=points[0].track)
+    assert fit_error(SimpleNamespace(points3D=points)) == pytest.approx(np.sqrt(0.99 * 0.25 + 0.01 * 16))
 
 
 def test_nothing_of_prepare_waits_for_torch_before_what_moves_is_looked_for():

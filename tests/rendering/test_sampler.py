@@ -200,12 +200,12 @@ def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
     monkeypatch.setattr(dispatch, "_chosen", "torch")
     field = random_field(6, True, seed=16, planes=60, log_depths=(-3, 1.2))
     rays = bundle(*random_rays(field.plan, 80, seed=17))
-    looked_up, march = [], importlib.import_module("mmpi_ns.ops.march")
+    looked_up, march = [], importlib.import_module("mmpi_ns.sampler")
     shares = march.log_shares
     monkeypatch.setattr(march, "log_shares", lambda *args: looked_up.append(len(args[-1])) or shares(*args))
     stopped = render(field, rays, 1e-3, True)
     count = sum(looked_up)
-    monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)
     whole = render(field, rays, 1e-3, True)
     assert count < 0.8 * (sum(looked_up) - count), "nothing was stopped"
     assert (stopped.rgb - whole.rgb).abs().max() < 1e-4

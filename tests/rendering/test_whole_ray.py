@@ -10,7 +10,7 @@ import pytest
 import torch
 from hand_made import make_mpi, random_mpi, rays, samples_to_ndc, unit
 
-from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
+from mmpi_ns.blending import blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, render_colors
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.scene.geometry import Frames, inverse_distance, plane_hits, sample_disparity

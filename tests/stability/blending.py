@@ -22,9 +22,9 @@ from stability.cases import (
 )
 from stability.exact import Array
 
+from mmpi_ns.blending import blend_shares, blended_optical_depth
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import composite
-from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite import median_inverse_distance, render_colors
 
 composite_weights = composite.composite_weights.reference

@@ -122,7 +122,7 @@ def test_a_whole_ray_with_a_wrong_gradient_fails(monkeypatch):
             return 1.001 * grad
 
     right = blending.blend_shares
-    monkeypatch.setattr("mmpi_ns.ops.blending.blend_shares", lambda r, *rest: right(Scaled.apply(r), *rest))
+    monkeypatch.setattr("mmpi_ns.blending.blend_shares", lambda r, *rest: right(Scaled.apply(r), *rest))
     outcome = case.measure(FLOAT32)
     assert outcome.value.holds and not outcome.gradient.holds
 

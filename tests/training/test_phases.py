@@ -73,14 +73,14 @@ def test_only_reliability_trains_in_blend_and_everything_else_before():
 
 
 def test_rates_fall_by_the_given_decades_over_each_phase():
-    schedule = two_phase(decay_decades=2.0, finetune_share=0.25, finetune_rate=0.3)
+    schedule = two_phase(decay_decades=2.0, finetune_share=0.25)
     assert schedule.rate_factor("density", 0) == 1.0
     assert schedule.rate_factor("density", 10_000) == pytest.approx(0.1)
     assert schedule.rate_factor("density", 19_999) == pytest.approx(0.01, rel=1e-3)
     assert schedule.rate_factor("reliability", 20_000) == 1.0
-    assert schedule.rate_factor("density", 30_000) == pytest.approx(0.3)
-    assert schedule.rate_factor("reliability", 35_000) == pytest.approx(0.03)
-    assert schedule.rate_factor("density", 50_000) == pytest.approx(0.003)  # no further decay after the run
+    assert schedule.rate_factor("density", 30_000) == pytest.approx(1.0)
+    assert schedule.rate_factor("reliability", 35_000) == pytest.approx(0.1)
+    assert schedule.rate_factor("density", 50_000) == pytest.approx(0.01)  # no further decay after the run
 
 
 def test_rates_stay_for_a_share_of_each_phase_and_then_fall():
@@ -193,19 +193,17 @@ def test_phases_without_steps_are_left_out():
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
 def test_schedule_survives_json(training):
-    schedule = schedule_of(
-        training, 1234, decay_decades=0.7, decay_from=0.25, finetune_rate=0.2, release_shares=(0.5, 0.9)
-    )
+    schedule = schedule_of(training, 1234, decay_decades=0.7, decay_from=0.25, release_shares=(0.5, 0.9))
     assert Schedule.from_json(schedule.to_json()) == schedule
     assert hash(Schedule.from_json(schedule.to_json())) == hash(schedule)
 
 
 def test_numpy_settings_do_not_leak_into_rates():
     """A numpy scalar in an optimiser's rate makes checkpoints unreadable for torch's safe loader."""
-    schedule = schedule_of("two-phase", 100, decay_decades=np.float64(1.5), finetune_rate=np.float64(0.1))
-    assert type(schedule.decay_decades) is float and type(schedule.finetune_rate) is float
+    schedule = schedule_of("two-phase", 100, decay_decades=np.float64(1.5))
+    assert type(schedule.decay_decades) is float
     schedule.to_json()
-    by_hand = Schedule((Phase("joint", 0, 10),), (), np.float64(1.5), np.float64(0.5), np.float64(0.1))
+    by_hand = Schedule((Phase("joint", 0, 10),), (), np.float64(1.5), np.float64(0.5))
     assert type(schedule.rate_factor("density", 10)) is type(by_hand.rate_factor("density", 10)) is float
 
 
@@ -225,9 +223,9 @@ def test_impossible_schedules_name_the_setting(settings, word):
 
 
 def test_a_models_schedule_is_made_of_its_options():
-    options = ScheduleConfig("two-phase", decay_decades=2.0, decay_from=0.25, finetune_rate=0.3)
+    options = ScheduleConfig("two-phase", decay_decades=2.0, decay_from=0.25)
     schedule = make_schedule(options, 5000, 3)
-    assert (schedule.decay_decades, schedule.decay_from, schedule.finetune_rate) == (2.0, 0.25, 0.3)
+    assert (schedule.decay_decades, schedule.decay_from) == (2.0, 0.25)
     assert schedule.windows == 3
 
 

@@ -20,7 +20,7 @@ def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):
     now = [0.0]
     monkeypatch.setattr(report, "monotonic", lambda: now[0])
     settings = {"blend_share": 0.25, "finetune_share": 0.25, "growth_shares": (), "decay_decades": 1.0} | how
-    schedule = schedule_of("two-phase", steps, **settings, finetune_rate=1.0)
+    schedule = schedule_of("two-phase", steps, **settings)
     log = report.TrainingLog(schedule, 1000, 0, steps)
     for step in range(steps):
         now[0] += seconds_a_step + (60 if step == 0 else 0)

@@ -38,7 +38,6 @@ REFUSED = {
     P + "planes": [1],
     P + "height": [0],
     P + "width": [-5],
-    P + "max_voxels": [-1],
     P + "window_length": [-1.0, NAN],
     P + "faces": [(), ("up",)],
     M + "colour__feature_channels": [0],

@@ -1,6 +1,8 @@
-"""Blending by reliability: the share of a sample among the heads that cover its position (paper sec. III-C).
+"""Adaptive blending by reliability: the share of a sample among the heads that cover its position (paper sec. III-C).
 
-Plain torch, with gradients. The compiled marches contain their own form without gradients.
+Three steps: every head's reliability R at the sample (``log_shares``), shares P by a softmax over the heads that cover
+it (``blend_shares``), and the sample's optical depth once its alpha is multiplied by its share
+(``blended_optical_depth``). Plain torch, with gradients. The compiled marches contain their own form without gradients.
 """
 
 from __future__ import annotations
@@ -9,20 +11,21 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.heads import heads_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.scene.geometry import Frames, LocalRays, local_to_ndc
+from mmpi_ns.scene.geometry import LocalRays
 
 
 def blend_shares(
-    reliability: Float[Tensor, "N H"], cover: Bool[Tensor, "N H"], heads: Int[Tensor, "N"]
+    reliability: Float[Tensor, "N H"], covers: Bool[Tensor, "N H"], heads: Int[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """log P and log(1 - P) of each sample's own head among the heads that cover it.
 
     Args:
         reliability: R of every head at the sample's position; values of heads that do not cover it are ignored.
-        cover: which heads cover the position; a sample's own head must be among them.
+        covers: which heads cover the position; a sample's own head must be among them.
         heads: the head that each sample was taken from.
 
     Returns:
@@ -34,11 +37,11 @@ def blend_shares(
     reliability = reliability.float() if reliability.dtype in (torch.float16, torch.bfloat16) else reliability
     lowest = torch.finfo(reliability.dtype).min
     # Only differences matter, and they are exact only for small numbers: the highest becomes 0.
-    highest = torch.where(cover, reliability, torch.full_like(reliability, lowest)).amax(-1, keepdim=True).detach()
+    highest = torch.where(covers, reliability, torch.full_like(reliability, lowest)).amax(-1, keepdim=True).detach()
     reliability = reliability - highest
-    is_own = torch.arange(cover.shape[-1], device=cover.device) == heads[:, None]
+    is_own = torch.arange(covers.shape[-1], device=covers.device) == heads[:, None]
     own_value = torch.where(is_own, reliability, torch.zeros_like(reliability)).sum(-1)
-    others = cover & ~is_own
+    others = covers & ~is_own
     has_others = others.any(-1)
     # A row without others would be a logsumexp over nothing: give it a harmless row and mask the result.
     other_values = torch.where(others, reliability, torch.full_like(reliability, lowest))
@@ -92,25 +95,16 @@ def log_shares(
         heads: head that each sample was taken from.
     """
     chosen, texels, cover = [], [], []
-    for j, grid in enumerate(layout.grids):
-        if j < len(layout.mpis):
-            origins, directions = (x[:, j].index_select(0, rays) for x in (local.local_origins, local.local_directions))
-            point = origins * inverse_t[:, None] + directions
-            frame = Frames(*(x[j : j + 1] for x in vars(layout.frames).values()))
-            ndc, inside = (x[:, 0] for x in local_to_ndc(point[:, None], inverse_t[:, None], frame))
-        else:
-            assert layout.cube is not None
-            origins, directions = (x.index_select(0, rays) for x in (local.origins, local.directions))
-            ndc = layout.cube.normalised(origins + directions / inverse_t.clamp(min=1e-10)[:, None])
-            ndc, inside = ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1) & (inverse_t > 0)
-        is_own = heads == j
+    for head in heads_of(layout):
+        ndc, inside = head.place_on_rays(local, rays, inverse_t)
+        is_own = heads == head.number
         votes = inside | is_own
         # Counting them would synchronise with a GPU: there all samples are looked up, the others in the empty brick.
         on_gpu = heads.device.type != "cpu" or dispatch.interpreting
         index = torch.arange(len(heads), device=heads.device) if on_gpu else votes.nonzero()[:, 0]
         position, reads = ndc[index], votes[index]
-        rows, weights = grid.trilinear(position)
-        trained = reads & (touched[grid.nearest(position)] > 0)
+        rows, weights = head.grid.trilinear(position)
+        trained = head.covers(touched, position, reads)
         chosen.append(index)
         texels.append((rows * reads[:, None], weights))
         cover.append(torch.zeros_like(is_own).index_copy(0, index, trained) | is_own)
