@@ -17,9 +17,9 @@ from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.config import mmpi_small
-from mmpi_ns.data.datamanager import load_observations
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.scripts.command import run
+from mmpi_ns.scripts.plan import load_observations
 
 
 @dataclass

@@ -46,7 +46,7 @@ def test_the_plan_is_that_of_training(scene, tmp_path, monkeypatch):
     config.model.method, config.model.total_steps, config.model.lpips_net = "mmpi-small", 0, "none"  # as the trainer
     config.model.placement.max_texels = 1e5
     pipeline = config.setup(device="cpu", test_mode="val")
-    assert pipeline.datamanager.depth_priors.share > 0.1
+    assert pipeline.datamanager.priors.depths.share > 0.1
     assert pipeline.model.progress.windows == WindowedPlan.load(tmp_path / "plan" / "plan.json")
 
 
