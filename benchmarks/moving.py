@@ -7,7 +7,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -91,17 +91,20 @@ class MovingBench(Bench):
 def masked_shares(data: Path, downscale_factor: int) -> Row:
     """Shares of a capture's training pixels that are masked, and of what moves and stands where that is known."""
     config: Any = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
-    config.data, config.new_view_share, config.correct_exposure = data, 0.0, False
-    config.dense_depth = config.depth_images = config.mask_moving = False
+    config.data, config.new_view_share = data, 0.0
+    none = {"dense_depth": False, "depth_images": False, "mask_moving": False, "correct_exposure": False}
+    config.priors = replace(config.priors, **none)
     config.dataparser.downscale_factor = downscale_factor
     manager = config.setup(device="cpu", test_mode="val")
     dataset, observations = manager.train_dataset, manager.observations
+    posed = posed_images(observations, dataset)
+    assert posed is not None
+    original, (seen_by, points) = at_full_size(posed), observations.tracked
     start = time.process_time()
-    masks, _ = moving_masks(observations, dataset)
+    masks, _ = moving_masks(original, [(int(h), int(w)) for w, h in observations.sizes], seen_by, points)
     seconds = (time.process_time() - start) / len(masks)
     row: Row = {"images": len(masks), "seconds_an_image": seconds}
-    if seconds > CACHED and (posed := posed_images(observations, dataset)) is not None:
-        original, (seen_by, points) = at_full_size(posed), observations.tracked
+    if seconds > CACHED:
         keys = key_images(original, lambda i: points[seen_by == i], COMPARED)
         start = time.process_time()
         deque(find_depths(original, lambda i: points[seen_by == i], SIDE, rounds=ROUNDS, among=keys), maxlen=0)

@@ -60,10 +60,12 @@ def give_depths(data: Path, downscale_factor: int) -> None:
     from nerfstudio.data.datasets.depth_dataset import DepthDataset, InputDataset
 
     from mmpi_ns.data.datamanager import MMPIDataManagerConfig
+    from mmpi_priors.settings import CapturePriorsConfig
 
     parser = NerfstudioDataParserConfig(data=data, downscale_factor=downscale_factor)
-    manager = MMPIDataManagerConfig(data=data, dataparser=parser).setup(device="cpu", test_mode="val")
-    names, known = manager.train_dataset.image_filenames, manager.depth_priors
+    config = MMPIDataManagerConfig(data=data, dataparser=parser, priors=CapturePriorsConfig())
+    manager = config.setup(device="cpu", test_mode="val")
+    names, known = manager.train_dataset.image_filenames, manager.priors.depths
     if known is None or known.share == 0:
         raise ValueError(f"{data}: no depth is known of any training pixel.")
     inverse = {name: torch.from_numpy(known.image(i)[..., :1]) for i, name in enumerate(names)}

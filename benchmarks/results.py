@@ -14,11 +14,11 @@ from methods import Method
 from report import Report, Row, page, slug, table
 from suites import DEFAULT, SUITES
 
-from mmpi_ns.data.datamanager import load_observations
 from mmpi_ns.placement.errors import PixelErrors, pixel_errors
 from mmpi_ns.placement.observations import find_visible_points
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.command import run
+from mmpi_ns.scripts.plan import load_observations
 
 RAYS_PER_STEP = 1024
 

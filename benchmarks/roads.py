@@ -18,7 +18,6 @@ from PIL import Image
 from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene, config_of, trainer_of
-from mmpi_ns.data.datamanager import load_observations
 from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.metrics import ImageMetrics
@@ -26,6 +25,7 @@ from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.sampler import march, rays_of
 from mmpi_ns.scene.windows import Window
 from mmpi_ns.scripts.command import run
+from mmpi_ns.scripts.plan import load_observations
 from mmpi_scene import catalogue
 from mmpi_scene.dataset import image_name, write_dataset
 from mmpi_scene.scene import render

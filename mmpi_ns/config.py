@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
@@ -11,7 +12,6 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from mmpi_ns.data.datamanager import MMPIDataManagerConfig
-from mmpi_ns.data.priors import PriorsConfig
 from mmpi_ns.field.mmpi_field import ColourConfig
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import PLACEMENT, RAYS
@@ -23,11 +23,12 @@ from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import ScheduleConfig
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
 from mmpi_ns.training.trainer import MMPITrainerConfig
+from mmpi_priors.settings import CapturePriorsConfig
 
 PAPER_DATA = {
     "keypoint_rays": 0,
     "new_view_share": 0.0,
-    "priors": PriorsConfig(dense_depth=False, depth_images=False, mask_moving=False, correct_exposure=False),
+    "priors": CapturePriorsConfig(dense_depth=False, depth_images=False, mask_moving=False, correct_exposure=False),
 }
 """The paper trains on the colours of pixels alone; no point cloud is read either."""
 PAPER_SCHEDULE = ScheduleConfig(decay_from=0.0, decay_decades=1.5, release_weight=0.0)
@@ -45,6 +46,7 @@ def _method(
     if paper:  # from DVGO: total variation and nine features; and a network evaluated for every sample
         model.loss = LossWeights(tv_density=1e-5, tv_features=1e-6, tv_chroma=0.0)
         model.colour = ColourConfig(shading="sample", feature_channels=9)
+    data: dict[str, Any] = PAPER_DATA if paper else {"priors": CapturePriorsConfig()}
     config = MMPITrainerConfig(
         method_name=name,
         max_num_iterations=steps,
@@ -58,7 +60,7 @@ def _method(
             datamanager=MMPIDataManagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=not paper),
                 train_num_rays_per_batch=rays,
-                **(PAPER_DATA if paper else {}),
+                **data,
             ),
             model=model,
         ),

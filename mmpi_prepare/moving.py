@@ -8,15 +8,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
-from rich.progress import track
 
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_prepare.images import Photo
 from mmpi_prepare.poses import opencv_intrinsics
-from mmpi_priors.moving import draw_moving, find_moving, in_image
-from mmpi_priors.views import straightened_color
+from mmpi_priors.moving import draw_moving, moving_masks
 
 
 def write_masks(
@@ -47,25 +44,21 @@ def write_masks(
         distortion=lenses[:, 4:],
         fisheye=fisheye,
     )
-    views, moving, doubt = find_moving(
-        posed,
-        lambda i: np.reshape(
-            [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()], (-1, 3)
-        ),
-        lambda work, count: track(work, "Looking for what moves", count, console=CONSOLE),
-    )
+    seen = [
+        np.reshape([model.points3D[p.point3D_id].xyz for p in entry.points2D if p.has_point3D()], (-1, 3))
+        for entry in entries
+    ]
+    seen_by = np.repeat(np.arange(len(entries)), [len(points) for points in seen])
+    sizes = {photo.name: (photo.height, photo.width) for photo in photos}
+    moving, doubt = moving_masks(posed, [sizes[entry.name] for entry in entries], seen_by, np.concatenate(seen))
     if not any(mask.any() for mask in moving):
         return {}, doubt
     target.mkdir(parents=True, exist_ok=True)
-    number, shares = {entry.name: i for i, entry in enumerate(entries)}, {}
+    masks, shares = {entry.name: mask for entry, mask in zip(entries, moving, strict=True)}, {}
     for photo in photos:
-        shape, i = (photo.height, photo.width), number.get(photo.name)
-        mask = np.zeros(shape, bool)
-        if i is not None:
-            mask = in_image(views[i], moving[i], posed, i, shape)
+        mask = masks.get(photo.name, np.zeros(sizes[photo.name], bool))
         if mask.any():
             shares[photo.name] = float(mask.mean())
         Image.fromarray(np.where(mask, 0, 255).astype(np.uint8)).save(target / f"{photo.name}.png")
-    colors = ((entry.name, straightened_color(posed, i, views[i])) for i, entry in enumerate(entries))
-    draw_moving(picture, colors, moving)
+    draw_moving(picture, posed.files, list(moving))
     return shares, doubt

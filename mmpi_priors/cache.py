@@ -17,9 +17,12 @@ from filelock import FileLock, Timeout
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.utils.arrays import Arrays, Pairs, write_arrays
 from mmpi_ns.utils.files import cache_folder, write_atomically
 
+VERSION = 1
+"""Of all that is kept: results of another version are found anew."""
 KEPT = 24
 """Number of cached results; the least recently used is removed first."""
 
@@ -80,6 +83,12 @@ def held(
         return results[0]
 
     return result
+
+
+def kept(name: str, images: PosedImages, settings: Sequence[object], find: Callable[[], Arrays | Pairs]) -> Arrays:
+    """What ``find`` gives (see ``remembered``): kept under this name for these images, their cameras and settings."""
+    cameras = images.camera_to_worlds, images.intrinsics, images.distortion, images.fisheye
+    return remembered(digest(images.files, name, VERSION, *cameras, *settings), find)
 
 
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:

@@ -5,7 +5,7 @@ Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM po
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
@@ -28,14 +28,12 @@ from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import duration, say
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order, num_threads
-from mmpi_priors.cache import Computed, digest, remembered
+from mmpi_priors.cache import Computed, digest, kept
 from mmpi_priors.dense import SEARCH_SECONDS, SECONDS, Depth, find_depths
 from mmpi_priors.lone_depth import continued, is_lone
 from mmpi_priors.observe import POINT_ERROR, contradict, drop_masked, see_points
 from mmpi_priors.views import Map, View, look_up, straightened, strips
 
-VERSION = 17
-"""Version of the algorithm: cached depths of another version are recomputed."""
 FINER, LONGEST = 2.0, 1600
 """Images are matched at this multiple of the training size, if the originals are available, and their longer side has
 at most so many pixels."""
@@ -78,11 +76,11 @@ def make_depth_priors(
     cloud = None if observations.loose is None else see_points(observations.loose, posed)
     seen = observations if cloud is None else cloud.added_to(observations)
     if dense:
-        depths = _remembered_depths(original, posed, seen)
+        depths = _matched_depths(original, posed, seen)
     if dense and cloud is not None:
         cloud = see_points(cloud.points, posed, depths.image)
         seen = cloud.added_to(observations) if cloud.fits else replace(observations, loose=None)
-        depths = depths if cloud.fits else _remembered_depths(original, posed, seen)
+        depths = depths if cloud.fits else _matched_depths(original, posed, seen)
     if cloud is not None:
         say(cloud.describe())
         seen = drop_masked(seen, dataset)
@@ -95,7 +93,7 @@ def make_depth_priors(
     return depths, seen
 
 
-def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> DepthPriors:
+def _matched_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> DepthPriors:
     """Depths by dense matching, from the cache if possible."""
     seen_by, points = observations.tracked
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
@@ -116,13 +114,14 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
             progress=lambda work, count: track(work, "Depths", count, console=CONSOLE),
         )  # fmt: skip
 
-    cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    return _from_cache(digest(original.files, "depths", VERSION, side, shapes, *cameras, seen_by, points), match)
+    return _kept("depths", original, (side, shapes, seen_by, points), match)
 
 
-def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> DepthPriors:
-    """The codes of all images in turn, from the cache if the key is there."""
-    arrays = remembered(key, lambda: ((f"{i}", codes) for i, codes in enumerate(find())))
+def _kept(
+    name: str, images: PosedImages, settings: Sequence[object], find: Callable[[], Iterable[Codes]]
+) -> DepthPriors:
+    """The codes of all images in turn, from the cache if they are there (``cache.kept``)."""
+    arrays = kept(name, images, settings, lambda: ((f"{i}", codes) for i, codes in enumerate(find())))
     # One at a time: numpy parses the header of an array with ast, which fails at times in threads of CPython 3.11.
     reading = Lock()
 
@@ -212,12 +211,13 @@ def with_continued(depths: DepthPriors, posed: PosedImages, dataset: MMPIDataset
         return codes
 
     count = len(depths.codes)
-    cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
     contents = [digest((), codes) for codes in depths.codes]
-    key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
     work = "Extrapolating surfaces"
-    return _from_cache(key, lambda: track(in_order(codes_of, range(count)), work, count, console=CONSOLE))
+    return _kept(
+        "continued", posed, (contents, masks),
+        lambda: track(in_order(codes_of, range(count)), work, count, console=CONSOLE),
+    )  # fmt: skip
 
 
 def of_cells(observations: Observations, depths: DepthPriors, dataset: MMPIDataset) -> Observations:

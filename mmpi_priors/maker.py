@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.data.dataset import MMPIDataset, image_and_mask
+from mmpi_ns.data.dataset import image_and_mask
 from mmpi_ns.data.exif import light_of
 from mmpi_ns.data.posed_images import at_full_size, posed_images
-from mmpi_ns.data.priors import DepthPriors, Gains, Priors, PriorsConfig, SharedPoints
-from mmpi_ns.data.rays import Rays
+from mmpi_ns.data.priors import DepthPriors, Gains, Priors, PriorsMaker, SharedPoints
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_priors.depth_priors import make_depth_priors, of_cells
@@ -23,34 +23,17 @@ from mmpi_priors.moving import moving_masks, share_of_moving
 from mmpi_priors.new_views import find_shared_points
 from mmpi_priors.observe import drop_masked, observe
 from mmpi_priors.photometry import SAME_LIGHT, color_ratios, exposure_of_image, image_gains
+from mmpi_priors.settings import CapturePriorsConfig
 
 
-class PriorsMaker:
-    """Makes the priors of a capture as its settings ask.
+class CapturePriors(PriorsMaker):
+    """Makes the priors of a capture as its settings ask. ``make`` sets the ``moving`` masks of the data set."""
 
-    Args:
-        config: which priors.
-        outputs: of the data parser, for the training images.
-        dataset: the training images. Its ``moving`` masks are set by ``make``.
-        parser: settings of the data parser.
-        rays: makes rays through pixels of the training images.
-        seed: of all random draws.
-    """
-
-    def __init__(
-        self,
-        config: PriorsConfig,
-        outputs: DataparserOutputs,
-        dataset: MMPIDataset,
-        parser: DataParserConfig,
-        rays: Rays,
-        seed: int,
-    ) -> None:
-        self.config, self.outputs, self.dataset, self.parser = config, outputs, dataset, parser
-        self.rays, self.seed = rays, seed
+    def __init__(self, config: CapturePriorsConfig, **kwargs: Any) -> None:
+        super().__init__(config, **kwargs)
+        self.config = config
 
     def observe(self, find_points: bool) -> Observations:
-        """Training cameras and SfM points. Without ``find_points`` images, which may be absent, are not searched."""
         return observe(
             self.outputs, self.dataset, self.parser, self.config.sfm_path,
             find_points=find_points, triangulates=self.config.triangulate,
@@ -58,11 +41,10 @@ class PriorsMaker:
         )  # fmt: skip
 
     def make(self) -> Priors:
-        """All priors. Raises InputError naming an image, mask or depth image that cannot be used."""
         config, dataset, observations, movers = self.config, self.dataset, self.observe(find_points=True), ""
         if config.mask_moving and None in dataset.mask_files:
             # A mask file of the user wins over what is seen to move.
-            masks, doubt = moving_masks(observations, dataset)
+            masks, doubt = self._moving(observations)
             masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
             movers, is_masked = share_of_moving(masks), any(mask.any() for mask in masks)
             say(movers + (" (--pipeline.datamanager.priors.mask-moving False keeps them)." if is_masked else "."))
@@ -78,6 +60,14 @@ class PriorsMaker:
         gains = self._gains(observations, depths) if config.correct_exposure else None
         priors = Priors(observations, placement, depths, dataset.moving, movers, gains)
         return Priors(**{**vars(priors), "new_views": lambda *chosen: self._new_views(priors, *chosen)})
+
+    def _moving(self, observations: Observations) -> tuple[Sequence[NDArray[np.bool_]], str]:
+        """What moves in each image, and why that is doubtful; nothing where lenses cannot be undone."""
+        shapes = [(int(h), int(w)) for w, h in observations.sizes]
+        posed = posed_images(observations, self.dataset)
+        if posed is None:
+            return [np.zeros(shape, bool) for shape in shapes], ""
+        return moving_masks(at_full_size(posed), shapes, *observations.tracked)
 
     def _gains(self, observations: Observations, depths: DepthPriors | None) -> Gains | None:
         """Exposures of the training images, where they differ."""
@@ -121,17 +111,6 @@ class PriorsMaker:
         observed: Float[Tensor, "H W 3"],
         outputs: dict[str, Tensor],
     ) -> Float[Tensor, "3"] | None:
-        """Exposure of an evaluated image, by surfaces that training images near it show too; None if they show nothing,
-        or are gone.
-
-        Args:
-            observations: of the training cameras.
-            factors: exposures of the training images.
-            falloff: of colours towards the corners.
-            camera: of the evaluated image.
-            observed: its colours.
-            outputs: its rendering, for the depths.
-        """
         posed = posed_images(observations, self.dataset)
         if posed is None:
             return None

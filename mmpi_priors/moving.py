@@ -21,13 +21,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from rich.progress import track
 
-from mmpi_ns.data.dataset import MMPIDataset
-from mmpi_ns.data.posed_images import PosedImages, at_full_size, posed_images
-from mmpi_ns.placement.observations import Observations
+from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import duration
+from mmpi_ns.utils.files import opened
 from mmpi_ns.utils.parallel import in_order, num_threads, one_thread_each
-from mmpi_priors.cache import Arrays, Computed, digest, remembered
+from mmpi_priors.cache import Arrays, Computed, kept
 from mmpi_priors.dense import Depth, Progress, find_depths
 from mmpi_priors.moving_carry import Carried, carried
 from mmpi_priors.moving_doubt import doubt_of
@@ -62,8 +61,6 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
-VERSION = 21
-"""Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
 SHOWN, COLUMNS, WIDTH = 24, 4, 320
@@ -170,37 +167,46 @@ def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[i
     return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE
 
 
-def moving_masks(observations: Observations, dataset: MMPIDataset) -> tuple[Sequence[Mask], str]:
-    """What moves in each training image [H, W], and the doubt of ``find_moving``, from the cache if possible; nothing
-    where lenses cannot be undone."""
-    shapes = [(int(h), int(w)) for w, h in observations.sizes]
-    posed = posed_images(observations, dataset)
-    if posed is None:
-        return [np.zeros(shape, bool) for shape in shapes], ""
-    original, (seen_by, points) = at_full_size(posed), observations.tracked
+def moving_masks(
+    images: PosedImages,
+    shapes: Sequence[tuple[int, int]],
+    seen_by: NDArray[np.integer],
+    points: NDArray[np.float64],
+) -> tuple[Sequence[Mask], str]:
+    """What moves in each image [H, W], and the doubt of ``find_moving``, from the cache if possible.
+
+    Args:
+        images: the originals.
+        shapes: height and width of each mask; images may be trained on at another size.
+        seen_by: image of each observation of a point. [N]
+        points: observed points. [N, 3]
+    """
 
     def find() -> Arrays:
-        # Names a damaged file, of which OpenCV would print warnings first.
-        deque(in_order(lambda i: dataset.get_data(i, image_type="uint8"), range(len(dataset))), maxlen=0)
+        deque(in_order(_decode, images.files), maxlen=0)  # names a damaged one, of which OpenCV would print warnings
         forecast = duration(SECONDS * len(shapes) / num_threads())
         CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {forecast}.")
         views, masks, doubt = find_moving(
-            original, lambda i: points[seen_by == i],
+            images, lambda i: points[seen_by == i],
             progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),
         )  # fmt: skip
         return {
-            f"{i}": np.packbits(in_image(v, m, original, i, s) if m.any() else np.zeros(s, bool))
+            f"{i}": np.packbits(in_image(v, m, images, i, s) if m.any() else np.zeros(s, bool))
             for i, (v, m, s) in enumerate(zip(views, masks, shapes, strict=True))
         } | {"doubt": np.frombuffer(doubt.encode(), np.uint8)}
 
-    cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points), find)
+    stored = kept("moving", images, (shapes, seen_by, points), find)
 
     def unpacked(i: int) -> Mask:
         height, width = shapes[i]
         return np.unpackbits(np.asarray(stored[f"{i}"], np.uint8), count=height * width).reshape(height, width) > 0
 
     return Computed(len(shapes), unpacked), bytes(np.asarray(stored["doubt"], np.uint8)).decode()
+
+
+def _decode(file: Path) -> None:
+    with opened(file) as image:
+        image.load()
 
 
 def share_of_moving(masks: Sequence[Mask]) -> str:
@@ -215,23 +221,25 @@ def share_of_moving(masks: Sequence[Mask]) -> str:
     )
 
 
-def draw_moving(path: Path, images: Iterable[tuple[str, NDArray[np.uint8]]], masks: Sequence[Mask]) -> None:
+def draw_moving(path: Path, files: Sequence[Path], masks: Sequence[Mask]) -> None:
     """Writes the images in which most moves, in order, with what moves in red.
 
     Args:
         path: file of the picture; its folder is made.
-        images: name, and blue, green and red of each image [H, W, 3].
+        files: of the images.
         masks: what moves in each image [H, W]; something in at least one.
     """
     shares = [float(mask.mean()) for mask in masks]
-    most = {i for i in sorted(range(len(masks)), key=lambda i: -shares[i])[:SHOWN] if shares[i] > 0}
     tiles = []
-    for name, color, mask in ((*image, masks[i]) for i, image in enumerate(images) if i in most):
-        shown = color.copy()
-        shown[mask] = shown[mask] // 2 + np.array(RED, np.uint8)
-        height = round(WIDTH * color.shape[0] / color.shape[1])
-        tile = np.asarray(cv2.resize(shown, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
-        cv2.putText(tile, name, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 255, 255), 1)
+    for i in sorted(sorted(range(len(masks)), key=lambda i: -shares[i])[:SHOWN]):
+        if shares[i] == 0:
+            continue
+        height = round(WIDTH * masks[i].shape[0] / masks[i].shape[1])
+        image = cv2.imread(str(files[i]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        tile = np.asarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
+        mask = cv2.resize(masks[i].astype(np.float32), (WIDTH, height), interpolation=cv2.INTER_AREA) > EDGE
+        tile[mask] = tile[mask] // 2 + np.array(RED, np.uint8)
+        cv2.putText(tile, files[i].name, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 255, 255), 1)
         tiles.append(tile)
     height = max(tile.shape[0] for tile in tiles)
     tiles = [cv2.copyMakeBorder(t, 0, height - t.shape[0], 0, 0, cv2.BORDER_CONSTANT) for t in tiles]

@@ -27,12 +27,11 @@ from scipy.ndimage import minimum_filter
 
 from mmpi_ns.data.checks import say_once
 from mmpi_ns.data.dataset import MMPIDataset
-from mmpi_ns.data.posed_images import PosedImages, at_full_size, posed_images
-from mmpi_ns.data.rays import lens_directions
+from mmpi_ns.data.posed_images import PosedImages, at_full_size, camera_observations, posed_images
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, quoted
-from mmpi_priors.cache import Arrays, digest, remembered
+from mmpi_priors.cache import Arrays, kept
 from mmpi_priors.conventions import OPENGL, Matches, find_convention, in_words
 from mmpi_priors.patches import search_surfaces
 from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
@@ -45,8 +44,6 @@ MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
 POSES_OFF = 0.5
 """Error of the poses, in training pixels, above which it is reported."""
-TRACKS_VERSION = 4
-"""Version of the algorithm: cached tracks of another version are recomputed."""
 ENOUGH_KEYPOINTS = 20
 """Average number of keypoints in an image above which no surfaces need to be searched."""
 SEARCHED, SEARCHED_SIDE = 16, 220
@@ -131,8 +128,7 @@ def _find_points(
             CONSOLE.print(f"No SfM tracks: matching the features of {size}.")
             return {name: np.asarray(value) for name, value in vars(triangulate(originals)).items()}
 
-        cameras = originals.camera_to_worlds, originals.intrinsics, originals.distortion, originals.fisheye
-        stored: Mapping[str, Any] = remembered(digest(originals.files, "tracks", TRACKS_VERSION, *cameras), find)
+        stored: Mapping[str, Any] = kept("tracks", originals, (), find)
         model = SfmModel(**{**stored, "off": stored["off"].item()})
         CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
         observations = with_tracks(observations, model)
@@ -279,21 +275,9 @@ def read_observations(
 ) -> Observations:
     """Training cameras as they are used, with the SfM points and keypoints moved into their frame, and the points of a
     cloud [P, 3]. Raises InputError naming the image whose pose or intrinsics cannot be used."""
-    poses = np.array(cameras.camera_to_worlds.double().cpu())
-    flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
-    usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)
-    if not usable.all():
-        raise InputError(
-            f"The camera of {outputs.image_filenames[usable.argmin()]} has a pose or focal length that is no finite "
-            "number or not positive: correct it or remove the frame."
-        )
-    # The axes of an MPI come from a camera and must be orthonormal to more digits than poses in captures are.
-    left, _, right = np.linalg.svd(poses[:, :, :3])
-    poses[:, :, :3] = left @ right
-    sizes = torch.cat([cameras.width, cameras.height], -1).double().cpu().numpy()
-    loose = None if cloud is None else usable_points(cloud, poses[:, :, 3])
-    loose = loose if loose is not None and len(loose) else None
-    observations = Observations(poses, np.stack(flat, -1), sizes, lens=lens_directions(cameras), loose=loose)
+    observations = camera_observations(cameras, outputs.image_filenames)
+    if cloud is not None and len(loose := usable_points(cloud, observations.centers)):
+        observations = replace(observations, loose=loose)
     if sfm is None:
         return observations
     transform = outputs.dataparser_transform.double().numpy()

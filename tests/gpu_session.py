@@ -24,6 +24,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+STEPS = {"mmpi-small": (1000, (60, 500), 70), "mmpi-kitti": (800, (200, 640), 80), "mmpi": (1000, (60, 400), 80)}
+"""Steps of a pressed run, those after which steps by operations and graphs alternate, and seconds at most."""
 TRAININGS = {"mmpi": (20_000, 110), "splatfacto": (5000, 75), "nerfacto": (5000, 75), "mmpi-small": (4000, 50),
              "instant-ngp": (5000, 60)}  # fmt: skip
 """Steps, and seconds at most, of each method on the capture at full size."""
@@ -50,6 +52,7 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     """Everything, in the order of what is wanted most."""
     python, bench = [sys.executable], [sys.executable, "-m", "mmpi_ns.scripts.bench"]
     gpu, train = ([sys.executable, str(ROOT / "benchmarks" / name)] for name in ("gpu.py", "train.py"))
+    steps = [sys.executable, str(ROOT / "tests" / "gpu_steps.py")]
     where = ["--output", str(out), "--work", str(work)]
     look = "import platform, torch; print(platform.python_version(), torch.__version__, torch.version.cuda, flush=True)"
     look += "; import triton; print('Triton', triton.__version__, flush=True)"
@@ -58,8 +61,13 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     return [
         Part("device", ["nvidia-smi"], 20),
         Part("environment", [*python, "-c", look], 90),
-        Part("quick", [*bench, "gpu", "--quick", "--folder", str(work / "quick")], 120),
+        Part("quick", [*bench, "gpu", "--folder", str(work / "quick")], 120),
         Part("tests", [*python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", "tests/ops"], 120),
+        Part("costs", [*steps, "costs", "--out", str(out / "costs.json")], 40),
+        *(
+            Part(f"steps {name}", [*steps, name, *_steps(name, data, out, rehearse)], most)
+            for name, (*_, most) in STEPS.items()
+        ),
         Part("bench gpu", [*gpu, *small, *where, "--seconds", "1800" if rehearse else "120"], 150),
         *(
             Part(f"train {name}", [*train, *_training(name, steps, data, rehearse), *where], seconds)
@@ -88,6 +96,13 @@ def _training(name: str, steps: int, data: Path, rehearse: bool) -> list[str]:
     if rehearse:
         return [*words, "--device", "cpu", "--rays-per-batch", f"{name}=16"]
     return [*words, "--device", "cuda", "--rays-per-batch", "nerfacto=4096"]
+
+
+def _steps(name: str, data: Path, out: Path, rehearse: bool) -> list[str]:
+    """Options of ``gpu_steps.py``."""
+    count, stages, _ = (6, (2,), 0) if rehearse else STEPS[name]
+    words = ["--data", str(data), "--steps", str(count), "--stages", *map(str, stages)]
+    return [*words, "--out", str(out / f"steps-{name}.json")]
 
 
 def run_part(part: Part, seconds: float, log: Path) -> dict[str, object]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_map_only
+from waits import NO_LAUNCH, WAITING
 
 
 class Tape(TorchDispatchMode):
@@ -14,11 +15,21 @@ class Tape(TorchDispatchMode):
         super().__init__()
         self.done = []
         self.paused = False
+        self.nodes, self.waits = 0, []
+        """Kernels that a graph would hold, and operations that a GPU would be waited for."""
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         made = func(*args, **kwargs)
         if not (self.paused or func.is_view):
+            name = func.overloadpacket.__name__
+            self.nodes += not name.startswith(NO_LAUNCH)
+            by_mask = name.startswith("index") and any(
+                isinstance(i, torch.Tensor) and i.dtype in (torch.bool, torch.uint8)
+                for i in (args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else ())
+            )
+            if name in WAITING or by_mask:
+                self.waits.append(name)
             self.done.append((func, *tree_map_only(torch.Tensor, lambda x: x.detach(), (args, kwargs, made))))
         return made
 
@@ -43,7 +54,7 @@ class TapeRecorder:
     be put back by ``undo``."""
 
     def __init__(self, state):
-        self.state = state
+        self.state, self.tapes = state, []
 
     def record(self, run, generators):
         from triton.runtime.interpreter import GridExecutor
@@ -51,6 +62,7 @@ class TapeRecorder:
         tape, launch = Tape(), GridExecutor.__call__
 
         def noted(executor, *args, **kwargs):
+            tape.nodes += 1
             tape.done.append((lambda *_: launch(executor, *args, **kwargs), (), {}, None))
             tape.paused = True
             try:
@@ -68,4 +80,5 @@ class TapeRecorder:
         with torch.no_grad():
             for x, old in zip(self.state(), before, strict=True):
                 x.copy_(old)
+        self.tapes.append(tape)
         return tape

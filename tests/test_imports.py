@@ -32,8 +32,8 @@ COMMANDS = {
 }
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
 MAY_IMPORT |= {wing: others | {wing} for wing, others in (COMMANDS | COMPANIONS).items()}
-UPWARD: set[str] = set()
-"""Modules of the method that still import a companion."""
+ASSEMBLY = {"mmpi_ns.config": {"mmpi_priors"}}
+"""What puts the parts together, and companions that it names."""
 
 MODULES = {
     ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path
@@ -67,7 +67,7 @@ def wing(name: str) -> str:
 
 @pytest.mark.parametrize("name", sorted(MODULES))
 def test_a_module_imports_only_wings_before_its_own(name):
-    allowed = MAY_IMPORT.get(wing(name), set()) | (set(COMPANIONS) if name in UPWARD else set())
+    allowed = MAY_IMPORT.get(wing(name), set()) | ASSEMBLY.get(name, set())
     assert {wing(each) for each in imports(name)} - {""} <= allowed
 
 
@@ -120,8 +120,11 @@ def test_importing_the_package_imports_nothing_large():
 
 
 def test_importing_the_methods_reads_no_library_that_only_priors_or_scores_need():
-    """Every ns-* command imports them. OpenCV is among nerfstudio's own imports."""
-    code = "import sys, mmpi_ns.config; assert not {'scipy.signal', 'pycolmap', 'mmpi_priors'} & set(sys.modules)"
+    """Every ns-* command imports them. OpenCV is among nerfstudio's own imports; of priors the settings are read."""
+    code = (
+        "import sys, mmpi_ns.config; assert not {'scipy.signal', 'pycolmap'} & set(sys.modules); "
+        "assert {m for m in sys.modules if m.startswith('mmpi_priors')} == {'mmpi_priors', 'mmpi_priors.settings'}"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -22,7 +22,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.data.checks import PARSER_OPTIONS, check_transforms, colmap_models, say_once
+from mmpi_ns.data.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.data.copies import fit_cameras
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.priors import Gains, Priors, PriorsConfig
@@ -299,36 +299,3 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             future = self._thread.submit(draw, generator(seed, step + 1, "pixels", device))
             self._ahead = sources, (step + 1, pixel_rays), future
         return batch
-
-
-def load_observations(
-    data: Path, downscale_factor: int | None = None, parser: Parser = "auto", search: bool = True
-) -> tuple[Observations, MMPIDataManager]:
-    """The observations that training on a scene would use for placement, and the data manager. Raises InputError if the
-    folder holds no scene, or one that cannot be trained.
-
-    Args:
-        data: the scene's folder.
-        downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
-        parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
-        search: for movers and depths of pixels, which takes minutes; without it tracks or searched surfaces alone.
-    """
-    config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig())
-    is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
-    if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
-        models = colmap_models(data)
-        if not models:
-            raise InputError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
-        config.priors.sfm_path = Path(models[0])
-        config.dataparser = ColmapDataParserConfig(colmap_path=config.priors.sfm_path)
-    parser_config = config.dataparser
-    config.data = parser_config.data = data
-    parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]
-    # As ns-train does, so that it refuses what ns-train would refuse, and finds the depths that it would find.
-    config.priors = replace(config.priors, correct_exposure=False)  # placement does not ask for it
-    if not search:
-        config.priors = replace(config.priors, mask_moving=False, dense_depth=False, depth_images=False)
-    config.new_view_share = 0.0
-    manager = config.setup(device="cpu", test_mode="val")
-    assert manager.priors is not None
-    return manager.priors.placement, manager

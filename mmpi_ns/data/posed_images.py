@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from numpy.typing import NDArray
 
 from mmpi_ns.data.copies import shown_size, size_of, whole_of
 from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.rays import lens_directions
 from mmpi_ns.placement.observations import Observations
+from mmpi_ns.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -62,3 +65,21 @@ def at_full_size(images: PosedImages) -> PosedImages:
     reduced = np.stack(copies) / [shown_size(*pair) for pair in zip(copies, images.sizes, strict=True)]
     intrinsics = images.intrinsics * np.tile(scales * reduced, 2)
     return replace(images, files=files, sizes=np.stack(sizes), intrinsics=intrinsics)
+
+
+def camera_observations(cameras: Cameras, files: Sequence[Path]) -> Observations:
+    """Training cameras as they are used, without points. Raises InputError naming the image whose pose or intrinsics
+    cannot be used."""
+    poses = np.array(cameras.camera_to_worlds.double().cpu())
+    flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
+    usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)
+    if not usable.all():
+        raise InputError(
+            f"The camera of {files[usable.argmin()]} has a pose or focal length that is no finite "
+            "number or not positive: correct it or remove the frame."
+        )
+    # The axes of an MPI come from a camera and must be orthonormal to more digits than poses in captures are.
+    left, _, right = np.linalg.svd(poses[:, :, :3])
+    poses[:, :, :3] = left @ right
+    sizes = torch.cat([cameras.width, cameras.height], -1).double().cpu().numpy()
+    return Observations(poses, np.stack(flat, -1), sizes, lens=lens_directions(cameras))

@@ -1,26 +1,27 @@
 """What the images of a capture tell beside their colours: a record that training, placement and evaluation read.
 
-``mmpi_priors`` makes it; a training without priors has an empty one.
+Here it is made of the cameras alone; ``mmpi_priors`` searches the images for the rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib import import_module
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, Int16, UInt8
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.base_config import InstantiateConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from numpy import ndarray
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.posed_images import camera_observations
 from mmpi_ns.data.rays import Rays
 from mmpi_ns.placement.observations import Observations
 
@@ -35,35 +36,6 @@ SPAN, SPAN_ERRORS = 0.03, 6.0
 """and if 80 % of the log gains span at least this, and this many of their errors."""
 MOST_HEADROOM = 0.5
 """Smallest factor of the field's reference exposure."""
-
-
-@dataclass
-class PriorsConfig(InstantiateConfig):
-    """Which priors are made of a capture: ``--pipeline.datamanager.priors.*``."""
-
-    _target: Any = "mmpi_priors.maker:PriorsMaker"
-    """Module and class, imported when a capture is read."""
-    sfm_path: Path = Path("colmap/sparse/0")
-    """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
-    triangulate: bool = True
-    """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
-    trust_cameras: bool = False
-    """Train even if the cameras contradict the images (looked into in scenes without tracks)."""
-    dense_depth: bool = True
-    """Match the originals of neighbouring training images densely at the start, for the depth of most pixels (about a
-    second for a million pixels on one core, on all cores; kept in ~/.cache/mmpi_ns for the next start)."""
-    depth_images: bool = True
-    """Use the depth images that a data parser lists (depth_file_path)."""
-    mask_moving: bool = True
-    """Mask what moves (cars, people) in the training images that have no mask: its pixels are not trained on."""
-    correct_exposure: bool = True
-    """Calibrate exposure and white balance of the images, by surfaces that several show and by EXIF, and compare each
-    image with the scene at its own exposure, if that explains how images differ."""
-
-    def setup(self, **kwargs: Any) -> Any:
-        """The maker of priors."""
-        module, name = self._target.split(":")
-        return getattr(import_module(module), name)(self, **kwargs)
 
 
 @dataclass(frozen=True)
@@ -226,3 +198,65 @@ class Priors:
     new_views: Callable[..., tuple[SharedPoints | None, str]] | None = None
     """Points that two of some images see at the same depth, and the reason where there are none, for images, a device
     and exposures; None if nobody looked."""
+
+
+@dataclass
+class PriorsConfig(InstantiateConfig):
+    """Settings of what is told of a capture beside its colours: here, nothing but the cameras."""
+
+    _target: type = field(default_factory=lambda: PriorsMaker)
+
+
+class PriorsMaker:
+    """Makes the record of the cameras alone. ``mmpi_priors`` has one that searches the images.
+
+    Args:
+        config: which priors.
+        outputs: of the data parser, for the training images.
+        dataset: the training images.
+        parser: settings of the data parser.
+        rays: makes rays through pixels of the training images.
+        seed: of all random draws.
+    """
+
+    def __init__(
+        self,
+        config: PriorsConfig,
+        outputs: DataparserOutputs,
+        dataset: MMPIDataset,
+        parser: DataParserConfig,
+        rays: Rays,
+        seed: int,
+    ) -> None:
+        self.outputs, self.dataset, self.parser, self.rays, self.seed = outputs, dataset, parser, rays, seed
+
+    def observe(self, find_points: bool) -> Observations:
+        """Training cameras and SfM points. Without ``find_points`` images, which may be absent, are not searched."""
+        return camera_observations(self.dataset.cameras, self.dataset.image_filenames)
+
+    def make(self) -> Priors:
+        """All priors. Raises InputError naming an image, mask or depth image that cannot be used."""
+        observations = self.observe(find_points=True)
+        return Priors(observations, observations)
+
+    def exposure_of(
+        self,
+        observations: Observations,
+        factors: Float[Tensor, "M 3"],
+        falloff: Float[Tensor, "2 3"],
+        camera: Cameras,
+        observed: Float[Tensor, "H W 3"],
+        outputs: dict[str, Tensor],
+    ) -> Float[Tensor, "3"] | None:
+        """Exposure of an evaluated image, by surfaces that training images near it show too; None if they show nothing,
+        or are gone.
+
+        Args:
+            observations: of the training cameras.
+            factors: exposures of the training images.
+            falloff: of colours towards the corners.
+            camera: of the evaluated image.
+            observed: its colours.
+            outputs: its rendering, for the depths.
+        """
+        return None

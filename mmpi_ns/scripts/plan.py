@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import run
-from mmpi_ns.utils.errors import InputError, looked_at, quoted
+from mmpi_ns.utils.errors import InputError, looked_at, quoted, say
 
 if TYPE_CHECKING:
+    from mmpi_ns.data.datamanager import MMPIDataManager
     from mmpi_ns.placement.observations import Observations
     from mmpi_ns.scene.windows import WindowedPlan
+
+
+Parser = Literal["auto", "nerfstudio", "colmap"]
 
 
 @dataclass
@@ -33,7 +38,7 @@ class PlanCommand:
     """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window)."""
     downscale_factor: int | None = None
     """Size of the images, as for the data parser."""
-    parser: Literal["auto", "nerfstudio", "colmap"] = "auto"
+    parser: Parser = "auto"
     """Format of the scene."""
     plan_file: Path | None = None
     """Evaluate this plan instead of making a new one."""
@@ -42,7 +47,6 @@ class PlanCommand:
 
     def main(self) -> None:
         # Slow imports, which --help does not need.
-        from mmpi_ns.data.datamanager import load_observations
         from mmpi_ns.placement.split import most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import make_writable
@@ -100,6 +104,47 @@ class PlanCommand:
 def _mark(plan: Path) -> str:
     """Comment with a plan's hash, which reveals later edits of the plan; plan.md does not show it."""
     return f"<!-- plan.json: {hashlib.sha256(plan.read_bytes()).hexdigest()} -->"
+
+
+def load_observations(
+    data: Path, downscale_factor: int | None = None, parser: Parser = "auto", search: bool = True
+) -> tuple[Observations, MMPIDataManager]:
+    """The observations that training on a scene would use for placement, and the data manager. Raises InputError if the
+    folder holds no scene, or one that cannot be trained.
+
+    Args:
+        data: the scene's folder.
+        downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
+        parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
+        search: for movers and depths of pixels, which takes minutes; without it tracks or searched surfaces alone.
+    """
+    # Slow imports, which --help does not need.
+    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+
+    from mmpi_ns.config import mmpi_small
+    from mmpi_ns.data.checks import colmap_models
+
+    config: Any = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
+    is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
+    if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
+        models = colmap_models(data)
+        if not models:
+            raise InputError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
+        config.priors.sfm_path = Path(models[0])
+        config.dataparser = ColmapDataParserConfig(colmap_path=config.priors.sfm_path)
+    config.data = config.dataparser.data = data
+    config.dataparser.downscale_factor = downscale_factor
+    # As ns-train does, so that it refuses what ns-train would refuse, and finds the depths that it would find.
+    config.priors = replace(config.priors, correct_exposure=False)  # placement does not ask for it
+    if not search:
+        config.priors = replace(config.priors, mask_moving=False, dense_depth=False, depth_images=False)
+    config.new_view_share = 0.0
+    manager = config.setup(device="cpu", test_mode="inference")
+    if not any(Path(file).is_file() for file in manager.train_dataset.image_filenames):
+        say(f"The images of {data} are not there: its cameras and points alone are judged.")
+        return manager.observations, manager
+    manager = config.setup(device="cpu", test_mode="val")
+    return manager.priors.placement, manager
 
 
 def entrypoint() -> None:

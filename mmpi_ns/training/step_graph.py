@@ -123,10 +123,14 @@ class StepGraphs:
 
     def _forget(self) -> None:
         """The tables have changed: nothing that was recorded holds any more."""
-        self._recorded: dict[Any, Recorded] = {}
+        self._drop()
         self._pending: deque[tuple[Any, Tensor, Capacity]] = deque()
         self._measured, self._most, self.capacity = 0, Counter[int](), None
-        self._recorder = None
+
+    def _drop(self) -> None:
+        """Drops what was recorded, with its memory."""
+        self._recorded: dict[Any, Recorded] = {}
+        self._recorder = None  # torch shares no memory of graphs that are gone
 
     # A step ------------------------------------------------------------------------------------------------------
 
@@ -140,8 +144,8 @@ class StepGraphs:
         if recorded is None:
             try:
                 recorded = self._record(step, kind)
-            except RuntimeError as error:
-                self._give_up(f"the driver refuses to record it ({brief(error)})")
+            except Exception as error:
+                self._give_up(f"they cannot be recorded ({type(error).__name__}: {brief(error)})")
                 return self._measured_step(step)
             if recorded is None:
                 return self._measured_step(step)
@@ -261,7 +265,7 @@ class StepGraphs:
             if any(full) and capacity is self.capacity:  # what does not fit may not be counted whole
                 counts = zip(used, room, full, strict=True)
                 self._note([max(n, int(MARGIN * n), most) if is_full else n for n, most, is_full in counts])
-                self._recorded = {}
+                self._drop()
 
     # Recording ---------------------------------------------------------------------------------------------------
 
@@ -301,7 +305,7 @@ class StepGraphs:
         gradients.replay()
         if expected is not None:
             if differs := self._difference(expected, (held[0].values, self._gradients())):
-                self._give_up(f"it repeats otherwise than it was recorded ({differs})")
+                self._give_up(f"repeated they compute something else ({differs})")
                 return None
             self._compared.add(of_kind)
 

@@ -255,6 +255,7 @@ class MMPITrainer(Trainer):
                     "yellow",
                 )
                 dispatch.choose("torch")
+                self._graphs = None
         if self._graphs is None or self._graphs.is_off:
             loss, *others = super().train_iteration(step)
         else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -13,11 +14,11 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
-from training_runs import datamanager, in_capture_frame, plan_of
+from training_runs import datamanager, in_capture_frame, plan_of, ready, trainer_config, write_plan
 
 from mmpi_ns.data import rays
 from mmpi_ns.data.checks import say_once
-from mmpi_ns.data.priors import UNKNOWN, DepthPriors
+from mmpi_ns.data.priors import UNKNOWN, DepthPriors, PriorsConfig
 from mmpi_ns.data.rays import CameraRays, image_rays
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scene.plan import ScenePlan
@@ -67,6 +68,22 @@ def test_rays_drawn_ahead_are_those_of_the_step_whatever_comes_between(scene, ma
         assert set(ahead.next_train(5)[1]["indices"][:, 0].tolist()) == {2}
     finally:
         torch.set_num_threads(1)
+
+
+def test_without_priors_cameras_alone_are_known_and_pixels_alone_are_drawn(scene, tmp_path, monkeypatch):
+    config = trainer_config(scene, write_plan(scene, tmp_path / "plan.json"), tmp_path / "outputs", steps=3)
+    monkeypatch.setitem(sys.modules, "mmpi_priors.maker", None)  # importing it fails
+    config.pipeline.datamanager.priors = PriorsConfig()
+    trainer = ready(config)
+    manager = trainer.pipeline.datamanager
+    record = manager.priors
+    assert record.depths is record.masks is record.gains is record.new_views is None
+    assert len(record.placement.centers) == len(TRAIN) and not len(record.placement.points)
+    drawn, batch = manager.next_train(0)
+    assert len(drawn) == len(batch["indices"]) and not drawn.disparities.any() and not drawn.keypoint_disparities.any()
+    before = trainer.pipeline.model.field.density.data.clone()
+    trainer.train()
+    assert not torch.equal(before, trainer.pipeline.model.field.density.data)
 
 
 def test_a_share_of_the_rays_is_drawn_if_asked_for(scene):

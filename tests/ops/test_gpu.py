@@ -20,7 +20,7 @@ from mmpi_ns.ops import dispatch
 @needs_triton
 def test_kernels_by_the_interpreter():
     """The variable must be set before Triton is imported, so these tests have a process of their own."""
-    files = [str(HERE / "ops" / f"interpreted_{part}.py") for part in ("march", "rows", "show", "steps")]
+    files = [str(HERE / "ops" / f"interpreted_{part}.py") for part in ("march", "rows", "sums", "show", "steps")]
     found = python("-m", "pytest", "-p", "no:cacheprovider", *files, TRITON_INTERPRET="1")
     assert found.returncode == 0, found.stdout[-6000:] + found.stderr[-2000:]
     passed = re.search(r"(\d+) passed", found.stdout)

@@ -219,8 +219,8 @@ def test_threads_read_cached_depths_one_at_a_time(monkeypatch):
             return super().__getitem__(name)
 
     codes = packed(np.full((HEIGHT, WIDTH, 2), 0.25))
-    monkeypatch.setattr(depth_priors, "remembered", lambda *_: Arrays({f"{i}": codes for i in range(20)}))
-    known = depth_priors._from_cache("", list)
+    monkeypatch.setattr(depth_priors, "kept", lambda *_: Arrays({f"{i}": codes for i in range(20)}))
+    known = depth_priors._kept("", None, (), list)
     with ThreadPoolExecutor(8) as pool:
         images = list(pool.map(known.image, range(20)))
     assert len(images) == 20 and (images[0] == 0.25).all()

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from training_runs import datamanager
 
-from mmpi_ns.data.datamanager import load_observations
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_priors import moving
 from mmpi_priors.dense import Depth
@@ -91,7 +90,7 @@ def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):
     masked = [~manager.train_dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy() for i in range(8)]
     assert sum(mask.sum() for mask in masked) > 1000
     for i, mask in enumerate(masked):
-        assert not manager.depth_priors.image(i)[mask].any()
+        assert not manager.priors.depths.image(i)[mask].any()
     for step in range(20):
         image, row, column = manager.next_train(step)[1]["indices"].T.tolist()
         assert not any(masked[i][r, c] for i, r, c in zip(image, row, column, strict=True))
@@ -101,38 +100,19 @@ def test_masks_of_the_user_win_and_the_option_leaves_all_pixels(drive, manager):
     assert manager.train_dataset.has_masks and not manager.eval_dataset.has_masks
     kept = datamanager(drive, mask_moving=False)
     assert not kept.train_dataset.has_masks
-    assert kept.depth_priors.share > manager.depth_priors.share
+    assert kept.priors.depths.share > manager.priors.depths.share
 
 
-def test_masks_of_some_frames_win_and_what_moves_in_the_others_is_masked(drive, manager, tmp_path):
-    meta = json.loads((drive / "transforms.json").read_text())
-    moving = [mask.any() for mask in manager.train_dataset.moving]
-    number = moving.index(True)
-    name = manager.train_dataset.image_filenames[number].name
-    frame = next(frame for frame in meta["frames"] if frame["file_path"].endswith(name))
-    frame["mask_path"] = "by-hand.png"
-    cv2.imwrite(str(tmp_path / "by-hand.png"), np.full((180, 320), 255, np.uint8))
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    for entry in drive.iterdir():
-        if entry.name != "transforms.json":
-            (tmp_path / entry.name).symlink_to(entry)
-    partly = datamanager(tmp_path)
-    assert partly.train_dataset.get_data(number, "uint8")["mask"].all()
-    assert "in 7 of 8 images" in partly.moves or not all(moving)
-    for i in set(range(8)) - {number}:
-        np.testing.assert_array_equal(partly.train_dataset.moving[i], manager.train_dataset.moving[i])
-
-
-def test_the_plan_shows_what_moves(drive, manager, tmp_path):
-    _, moves = load_observations(drive, moving=tmp_path / "report" / "moving.jpg")
-    assert moves == manager.moves and re.fullmatch(r".* % of the training pixels, in \d of 8 images, show .*", moves)
-    picture = cv2.imread(str(tmp_path / "report" / "moving.jpg"))
+def test_what_moves_is_told_and_drawn(manager, tmp_path):
+    dataset, path = manager.train_dataset, tmp_path / "report" / "moving.jpg"
+    assert re.fullmatch(r".* % of the training pixels, in \d of 8 images, show .*", manager.priors.movers)
+    moving.draw_moving(path, [Path(file) for file in dataset.image_filenames], dataset.moving)
+    picture = cv2.imread(str(path))
     assert picture.shape == (2 * 180, 4 * 320, 3)
-    original = cv2.imread(str(manager.train_dataset.image_filenames[0]))
+    original = cv2.imread(str(dataset.image_filenames[0]))
     redder = picture[:180, :320, 2].astype(int) - original[..., 2] > 30
-    mask = manager.train_dataset.moving[0]
+    mask = dataset.moving[0]
     assert redder[mask].mean() > 0.5 and redder[~mask].mean() < 0.02
-    assert load_observations(drive)[1] == ""
 
 
 def a_view(shift=0.0, gray=None) -> View:

@@ -11,31 +11,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from training_runs import datamanager, ready, trainer_config
 
 from mmpi_ns.config import mmpi_kitti, mmpi_small
-from mmpi_ns.training.options import check_nothing_left
 from mmpi_ns.utils.errors import InputError
-
-
-def model_of(text):
-    return yaml.load(text, Loader=yaml.Loader).pipeline.model
-
-
-def test_an_option_that_left_and_changes_the_images_is_named():
-    text = yaml.dump(mmpi_small.config)
-    check_nothing_left(model_of(text))
-    # As before options had groups.
-    model = model_of(text.replace("    schedule:", "    train_threshold: 3\n    schedule:"))
-    with pytest.raises(InputError, match=r"asks for --pipeline.model.train-threshold 3, which this version lacks"):
-        check_nothing_left(model)
-    model = model_of(text)
-    model.rendering.old_way = "x"
-    with pytest.raises(InputError, match=r"--pipeline.model.rendering.old-way 'x'"):
-        check_nothing_left(model)
-
-
-def test_an_option_that_left_and_changed_the_training_alone_is_passed_over():
-    model = model_of(yaml.dump(mmpi_small.config))
-    model.schedule.growing_rays = model.loss.tv_every = model.placement.texel_cost = 1
-    check_nothing_left(model)
 
 
 @pytest.mark.parametrize("method", [mmpi_small, mmpi_kitti])

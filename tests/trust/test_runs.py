@@ -408,11 +408,6 @@ def test_a_run_shows_no_warning_that_users_can_do_nothing_about(whole_scene, tmp
     assert ended.status == 0 and not ended.error.strip(), ended.error
 
 
-def test_a_traceback_is_shown_on_request(tmp_path):
-    ended = start_train(tmp_path / "no", tmp_path, environment={"MMPI_TRACEBACK": "1"}).end()
-    assert ended.status == 1 and "Traceback" in ended.error and "InputError: There is no" in ended.error
-
-
 def test_a_checkpoint_file_that_is_not_there_is_said(whole_scene, tmp_path):
     said = train(whole_scene, tmp_path, load_checkpoint=tmp_path / "no.ckpt").sentence
     assert "There is no checkpoint at" in said and "--load-checkpoint" in said

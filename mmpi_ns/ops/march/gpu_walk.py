@@ -52,9 +52,9 @@ ENDLESS, REACHED = tl.constexpr(1e30), tl.constexpr(1e9)
 """Distance to what a ray never reaches, and number of samples of the cube beyond which it reaches none."""
 NEGLIGIBLE = tl.constexpr(ends.NEGLIGIBLE)
 NEAREST_ZERO = tl.constexpr(ends.NEAREST_ZERO)
-ULPS, BORDER = tl.constexpr(16 * 2.0**-23), tl.constexpr(1 + 16 * 2.0**-23)
-"""Slack of the border test, as in ``geometry.local_to_ndc``, and the border with it: Triton 3.8's interpreter adds no
-constant to a number."""
+ULPS = tl.constexpr(16 * 2.0**-23)
+"""Slack of the border test, as in ``geometry.local_to_ndc``. Triton 3.8's interpreter divides no constant by
+an array."""
 
 # Crossings -----------------------------------------------------------------------------------------------------------
 
@@ -271,6 +271,29 @@ def _in_cube(cube, x, y, z):
 
 
 @triton.jit
+def in_mpi(constants, k, x, y, z, dx, dy, dz, inverse_t):
+    """NDC of a sample of a ray in MPI k, and whether it lies in its frustum (``geometry.local_to_ndc``)."""
+    mpi = constants + k * FLOATS
+    ox, oy, oz, lx, ly, lz = local_ray(mpi, x, y, z, dx, dy, dz)
+    ahead = oz * inverse_t + lz > 0
+    depth = tl.where(ahead, oz * inverse_t + lz, 1.0)
+    u, v = (ox * inverse_t + lx) / depth - tl.load(mpi + U0), (oy * inverse_t + ly) / depth - tl.load(mpi + V0)
+    u, v = u * tl.load(mpi + U_SCALE) - 1, v * tl.load(mpi + V_SCALE) - 1
+    s = 1 - tl.load(mpi + S_SCALE) * (inverse_t / depth - tl.load(mpi + END))
+    inside = (tl.abs(u) <= 1 + ULPS) & (tl.abs(v) <= 1 + ULPS) & (tl.abs(s) <= 1 / tl.load(mpi + SHARE) * ULPS + 1)
+    return tl.where(ahead, u, 0.0), tl.where(ahead, v, 0.0), tl.where(ahead, s, 0.0), ahead & inside
+
+
+@triton.jit
+def in_cube(cube, x, y, z, dx, dy, dz, inverse_t):
+    """Likewise in the cube."""
+    t = 1 / tl.maximum(inverse_t, NEAREST_ZERO)
+    u, v, s = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
+    inside = (inverse_t > 0) & (tl.abs(u) <= 1) & (tl.abs(v) <= 1) & (tl.abs(s) <= 1)
+    return u, v, s, inside
+
+
+@triton.jit
 def _count_vote(own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick):
     """Adds head k's vote on samples: (mpi vote, highest of the others, sum of e^(other - highest))."""
     is_own = head == k
@@ -294,22 +317,12 @@ def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, he
     thick = asked & (tau > NEGLIGIBLE)
     own_vote, highest, others = tau * 0, tau * 0 - 1e30, tau * 0
     for k in range(K):
-        mpi = constants + k * FLOATS
-        ox, oy, oz, lx, ly, lz = local_ray(mpi, x, y, z, dx, dy, dz)
-        ahead = oz * inverse_t + lz > 0
-        depth = tl.where(ahead, oz * inverse_t + lz, 1.0)
-        u, v = (ox * inverse_t + lx) / depth - tl.load(mpi + U0), (oy * inverse_t + ly) / depth - tl.load(mpi + V0)
-        u, v = u * tl.load(mpi + U_SCALE) - 1, v * tl.load(mpi + V_SCALE) - 1
-        s = 1 - tl.load(mpi + S_SCALE) * (inverse_t / depth - tl.load(mpi + END))
-        inside = (tl.abs(u) <= BORDER) & (tl.abs(v) <= BORDER) & (tl.abs(s) <= 1 + ULPS / tl.load(mpi + SHARE))
-        u, v, s = tl.where(ahead, u, 0.0), tl.where(ahead, v, 0.0), tl.where(ahead, s, 0.0)
+        u, v, s, inside = in_mpi(constants, k, x, y, z, dx, dy, dz, inverse_t)
         own_vote, highest, others = _count_vote(
-            own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, ahead & inside, thick
+            own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick
         )
     if HAS_CUBE:
-        t = 1 / tl.maximum(inverse_t, NEAREST_ZERO)
-        u, v, s = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
-        inside = (inverse_t > 0) & (tl.abs(u) <= 1) & (tl.abs(v) <= 1) & (tl.abs(s) <= 1)
+        u, v, s, inside = in_cube(cube, x, y, z, dx, dy, dz, inverse_t)
         own_vote, highest, others = _count_vote(
             own_vote, highest, others, grids, reliability, touched, K, head, u, v, s, inside, thick
         )
