@@ -34,7 +34,7 @@ PAPER_DATA = {
 PAPER_SCHEDULE = ScheduleConfig(decay_from=0.0, decay_decades=1.5, release_weight=0.0)
 """The paper's rates fall from the start, as DVGO's, and no bricks are released."""
 POSE_RATE = 1e-4
-"""Learning rate of refined poses, radians and scene units: a tenth of nerfacto's (docs/log/experiments.md)."""
+"""Learning rate of refined poses, radians and scene units: a tenth of nerfacto's (docs/ablations.md)."""
 
 
 def _method(

@@ -41,7 +41,7 @@ PLACED_ROUNDS = 2
 """Times that a globally placed model is given all points and adjusted: after one, the focal length may be far off."""
 TRACKS_PER_VIEW = 500
 """Tracks used for placing each image globally, the longest ones: using all takes twice as long on kitti-street and is
-no better (docs/log/prepare.md)."""
+no better (docs/ablations.md)."""
 STARTS = (0.7, 1.2)
 """Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
 NEAR = 0.1

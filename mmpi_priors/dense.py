@@ -71,7 +71,7 @@ MAX_RELATIVE = 0.15
 """Depths with a larger relative error are discarded."""
 AROUND, MEASURED = 1 / 20, 0.5
 """Side of the square about a pixel, as a fraction of the longer side of the image, and the share of measured pixels in
-it from which on planes add no depth: in gaps between matches they made pictures worse (docs/log/experiments.md)."""
+it from which on planes add no depth: in gaps between matches they made pictures worse (docs/ablations.md)."""
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
 TRIMMED = 8
@@ -223,7 +223,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
         return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
     flow: Flow = partial(find_motion, stride=STRIDE[is_large], rounds=COMPARISONS)
-    if rounds:  # OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/log/moving.md)
+    if rounds:  # OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/ablations.md)
         search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         search.setFinestScale(0)
         search.setVariationalRefinementIterations(0)

@@ -46,7 +46,7 @@ NOISE = 75
 ALL = 255
 TURNED = 3.0
 """Degrees between the facing directions of two images from which the camera turned between them. Where it goes straight
-on, what neighbours say nothing about is mostly what stands (docs/log/moving.md)."""
+on, what neighbours say nothing about is mostly what stands (docs/ablations.md)."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@
 Prints a line for each test camera and what is lost on average. Fails where the canvas has less than 38 dB to the image
 that Python renders of the same baked scene, or on average more than 0.1 dB less against the truth. What the baked
 scene's codes lose to the exact renderer is printed, too: since they hold details, a few tenths of a decibel
-(docs/log/export.md).
+(docs/ablations.md).
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class ColourConfig:
     """Evaluate the colour network once a ray, after compositing (ray), or for every sample as in the paper (sample)."""
     feature_channels: int = 8
     """Channels of a texel besides its density: three of a colour, the others features for view-dependent appearance.
-    Eight are half a cache line, so a CPU trains faster with them than with nine (docs/log/performance.md)."""
+    Eight are half a cache line, so a CPU trains faster with them than with nine (docs/ablations.md)."""
     hidden_width: int = 64
     """Width of the colour networks."""
 

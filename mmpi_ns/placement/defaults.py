@@ -20,7 +20,7 @@ RAYS_PER_PROCESSOR = 256
 at a time, so these and the rays of new views are some three rounds of them."""
 MOST_RAYS_TIMES = 4
 """Largest multiple of a method's rays: steps become as many times fewer. As many rays in a quarter of the steps give
-images as good, in an eighth worse ones (docs/log/performance.md)."""
+images as good, in an eighth worse ones (docs/ablations.md)."""
 POSITIVE, NOT_NEGATIVE = Number(0, above=True), Number(0)
 RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),

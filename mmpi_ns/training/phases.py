@@ -17,7 +17,7 @@ SOONER = 4
 """Texels double so many times as early where depths are known, and surfaces need not form."""
 GROWING_SHARE, FULL_STEPS = 0.5, 1250
 """Share of the batch drawn while texels grow from known surfaces, when rays cost most and coarse texels need few. Runs
-of at most so many steps draw all, those in between as many in all as these (docs/log/performance.md)."""
+of at most so many steps draw all, those in between as many in all as these (docs/ablations.md)."""
 COPIES_FROM = 0.75
 """Share of the time of high rates after which MPIs may get finer copies."""
 TRAINS: dict[str, frozenset[str]] = {

@@ -28,7 +28,7 @@ CPU_RAYS = 15000.0
 kitchen at a half (one core of an Intel Xeon)."""
 ONE_THREAD = 0.6
 """Share of a training that runs on one thread: 1,500 steps of kitti-street /4 took 78 s with one thread, 62 s with two
-on two free cores (docs/log/performance.md)."""
+on two free cores (docs/ablations.md)."""
 
 
 @dataclass(eq=False)

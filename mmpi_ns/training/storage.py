@@ -25,7 +25,7 @@ FORMING = 0.4
 WORTH = 1.25
 """Least multiple of texels for which tables grow beyond the plan."""
 ROOM = 0.4
-"""Share of the planned memory that finer texels may fill: more learn single images (docs/log/texel-size.md)."""
+"""Share of the planned memory that finer texels may fill: more learn single images (docs/ablations.md)."""
 MOST_COPIED = 0.1
 """Share of the bricks that get a finer copy for their own errors; those beside them get one, too."""
 

@@ -55,7 +55,7 @@ class TouchedAdam(torch.optim.Optimizer):
                     continue
                 state = self.state[param]
                 if not state:
-                    # Mean and uncentred variance. Those of a table are in bfloat16 (docs/log/performance.md has what
+                    # Mean and uncentred variance. Those of a table are in bfloat16 (docs/ablations.md has what
                     # that costs), and take no memory on a CPU until they are written to: most rows may never be.
                     table = isinstance(param, Table) and param.dtype == torch.float32
                     dtype, shape = torch.bfloat16 if table else param.dtype, (len(param), 2, *param.shape[1:])

@@ -42,18 +42,14 @@ def test_each_process_makes_its_gpu_the_current_one_before_anything_is_on_it(mon
 
 
 @pytest.mark.parametrize(
-    ("device", "steps", "asked", "rays", "keypoints"),
-    [("cuda", 0, False, 4096, 1536), ("cuda", 500, False, 1024, 384), ("cuda", 0, True, 1024, 384),
-     ("cpu", 0, False, 1024, 384)],
-)  # fmt: skip
-def test_a_large_gpu_draws_more_rays_a_step_unless_rays_or_steps_were_asked_for(
-    monkeypatch, tmp_path, device, steps, asked, rays, keypoints
+    ("device", "steps", "rays", "keypoints"), [("cuda", 0, 4096, 1536), ("cuda", 500, 1024, 384), ("cpu", 0, 1024, 384)]
+)
+def test_a_large_gpu_draws_more_rays_a_step_unless_steps_were_asked_for(
+    monkeypatch, tmp_path, device, steps, rays, keypoints
 ):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "set_device", lambda _: None)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace(multi_processor_count=132))
-    option = "--pipeline.datamanager.train-num-rays-per-batch"
-    monkeypatch.setattr(trainer_module, "values_of", lambda name: ["1024"] if asked and name == option else [])
     monkeypatch.setattr(Trainer, "setup", lambda *_: (_ for _ in ()).throw(Stop))
     config = copy.deepcopy(mmpi_small.config)
     config.machine.device_type, config.max_num_iterations = device, steps
