@@ -220,7 +220,7 @@ def test_a_disk_that_is_full_while_saving_leaves_the_last_checkpoint(trained, sc
     resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, limits[1]))  # the real writer fails half way through
     try:
         for step in (2, 3):
-            words = (f"step-{step:09d}.ckpt could not be written", "MB free", "make room", "--load-dir")
+            words = (f"step-{step:09d}.ckpt could not be written", "MB free", "make room")
             refusal(lambda step=step: trainer.save_checkpoint(step), *words, error=OSError)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

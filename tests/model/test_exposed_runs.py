@@ -13,7 +13,6 @@ from PIL import Image
 from tiny_scene import image_of, name_of, write_scene
 from training_runs import ready, trainer_config, write_plan
 
-from mmpi_ns.rendering import pipeline as pipelines
 from mmpi_ns.training.report import quick_test
 
 FACTORS = np.random.default_rng(3).uniform(0.55, 1.0, (8, 3))
@@ -46,7 +45,7 @@ def test_exposures_of_a_run_are_loaded_with_it(run):
 def test_a_test_image_is_scored_at_its_own_exposure(run, monkeypatch, capsys):
     _, pipeline = run
     raw = pipeline.get_average_eval_image_metrics()
-    monkeypatch.setattr(pipelines, "exposure_of_image", lambda *_: None)
+    monkeypatch.setattr(pipeline.datamanager, "exposure_of", lambda *_: None)
     at_mean = pipeline.get_average_eval_image_metrics()
     assert raw["psnr"] > at_mean["psnr"] + 1
     assert raw["cc_psnr"] == pytest.approx(at_mean["cc_psnr"], abs=0.5)

@@ -154,12 +154,12 @@ def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path)
         assert all(torch.isfinite(v) for v in losses.values())
 
 
-def test_the_weight_of_depth_priorss_falls_with_the_rates(scene, plan_file, tmp_path, monkeypatch):
+def test_the_weight_of_depth_priors_falls_with_the_rates(scene, plan_file, tmp_path, monkeypatch):
     trainer, weights = trainer_of(scene, plan_file, tmp_path, training="joint"), []
     real = mmpi_ns.model.batch_losses
 
     def recorded(*args):
-        weights.append(args[3].depth_priors)
+        weights.append(args[3].depth_priors * float(args[6]))
         return real(*args)
 
     monkeypatch.setattr(mmpi_ns.model, "batch_losses", recorded)

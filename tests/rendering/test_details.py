@@ -184,7 +184,7 @@ def test_details_of_another_checkpoint_are_not_shown(tmp_path, capsys):
     assert details_of(tmp_path / "none", 7) is None
     config = MMPIModelConfig()
     config.windows_folder = tmp_path / "windows"
-    model = SimpleNamespace(config=config, trains=False, details=None)
+    model = SimpleNamespace(config=config, trains=False, details=None, capture=None)
     capsys.readouterr()
     MMPIModel.update_to_step(model, 7)
     assert model.details is not None and not capsys.readouterr().out

@@ -6,7 +6,6 @@ and saves checkpoints without waiting for either.
 
 from __future__ import annotations
 
-import sys
 from threading import Thread
 
 import pytest
@@ -15,7 +14,6 @@ from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetT
 from training_runs import differences, ready, trainer_config, write_windows
 
 from mmpi_ns.field.tables import in_half_precision
-from mmpi_ns.utils.errors import InputError
 
 STEPS = 6
 
@@ -141,44 +139,3 @@ def test_a_rendering_that_is_interrupted_anywhere_changes_nothing_and_holds_no_l
     before = copied(model.field.state_dict())
     model.run.prepare_step(None, 2 * STEPS - 1)
     assert differences(dict(model.field.state_dict()), before) == [], "the next step trains what was trained"
-
-
-def test_an_interrupt_at_any_line_of_the_store_leaves_its_lock_free(run, model):
-    """Line by line: at the end of a ``with lock`` an exception would come before the lock is given back."""
-    found = set()
-    for number in range(1, 400):
-        model.store.forget(0)
-        trace = Interrupt(number)
-        try:
-            with SetTrace(trace):
-                model.store.load(0, model.device)
-        except IOChangeException:
-            pass
-        finally:
-            sys.settrace(None)
-        assert not model.store._lock.locked(), trace.line
-        if trace.line is None:
-            break
-        found.add(trace.line)
-    assert trace.line is None and any("window_store" in line for line in found)
-
-
-def test_windows_that_other_processes_have_not_finished_are_left_out(run, model):
-    """The first process' viewer shows what is there; everywhere else a lost window is an error."""
-    cameras = cameras_of(run)
-    whole = [model.get_outputs_for_camera(camera)["rgb"] for camera in cameras]
-    model.store.forget(0)
-    path, hidden = model.store.path(0), model.store.path(0).with_suffix(".hidden")
-    path.rename(hidden)
-    try:
-        with pytest.raises(InputError, match="Window 0 of this run is missing"):
-            model.get_outputs_for_camera(cameras[0])
-        model.run.shared = True
-        alone = [model.get_outputs_for_camera(camera)["rgb"] for camera in cameras]
-        assert torch.equal(alone[2], whole[2]) and alone[0].isfinite().all() and not torch.equal(alone[0], whole[0])
-        hidden.rename(path)
-        assert all(torch.equal(model.get_outputs_for_camera(c)["rgb"], w) for c, w in zip(cameras, whole, strict=True))
-    finally:
-        model.run.shared = False
-        if hidden.exists():
-            hidden.rename(path)

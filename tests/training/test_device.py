@@ -11,7 +11,6 @@ from nerfstudio.engine.trainer import Trainer
 from training_runs import trainer_config
 
 from mmpi_ns.config import mmpi_small
-from mmpi_ns.training import trainer as trainer_module
 from mmpi_ns.training.options import check_run
 from mmpi_ns.utils import machine
 from mmpi_ns.utils.errors import InputError
@@ -19,26 +18,6 @@ from mmpi_ns.utils.errors import InputError
 
 class Stop(Exception):
     """Ends a preparation where nerfstudio's begins."""
-
-
-@pytest.mark.parametrize("rank", [0, 1])
-def test_each_process_makes_its_gpu_the_current_one_before_anything_is_on_it(monkeypatch, tmp_path, rank):
-    """Tensors of rank 1 lie on cuda:1, and kernels start on the current device, which is cuda:0 otherwise."""
-    events = []
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "set_device", events.append)
-    monkeypatch.setattr(trainer_module.comms, "get_rank", lambda: rank)
-
-    def nerfstudios_setup(self, mode):
-        events.append(self.device)
-        raise Stop
-
-    monkeypatch.setattr(Trainer, "setup", nerfstudios_setup)
-    config = trainer_config(tmp_path, None, tmp_path)
-    config.machine.device_type = "cuda"
-    with pytest.raises(Stop):
-        config.setup(local_rank=rank, world_size=2).setup()
-    assert events == [rank, f"cuda:{rank}"]
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,7 @@ def prepared(scene, plan_file, folder, steps, **settings):
     """The field of a run after the callbacks before each of these steps."""
     config = trainer_config(scene, plan_file, folder, 60)
     for name, value in settings.items():
-        setattr(config.pipeline.datamanager, name, value)
+        setattr(config.pipeline.datamanager.priors, name, value)
     trainer = ready(config)
     for step in steps:
         for callback in trainer.callbacks:
@@ -184,7 +184,7 @@ def test_a_run_starts_from_the_depths_of_its_pixels_once(scene, plan_file, tmp_p
     assert not later.density.data[BRICK:].any(), "a run that goes on has surfaces already"
 
 
-def test_without_depth_priorss_every_plane_starts_alike(scene, plan_file, tmp_path):
+def test_without_depth_priors_every_plane_starts_alike(scene, plan_file, tmp_path):
     field = prepared(scene, plan_file, tmp_path, [0], dense_depth=False, depth_images=False, sfm_path="none")
     assert not field.density.data[BRICK:].any() and not field.features.data.any()
 

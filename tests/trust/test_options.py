@@ -177,17 +177,6 @@ def test_the_viewer_listens_on_this_machine_alone():
         assert getattr(config, name).config.viewer.websocket_host == "127.0.0.1"
 
 
-def test_ns_viewer_listens_on_this_machine_unless_it_is_asked_otherwise(monkeypatch):
-    from mmpi_ns import config
-
-    for words, host in ((["ns-viewer"], "127.0.0.1"), (["ns-viewer", "--viewer.websocket_host=0.0.0.0"], "0.0.0.0")):
-        given = copy.deepcopy(config.mmpi_small.config)
-        given.viewer.websocket_host, given.experiment_name = "0.0.0.0", "tiny"  # as ns-viewer sets it
-        monkeypatch.setattr("sys.argv", words)
-        given.get_base_dir()
-        assert given.viewer.websocket_host == host
-
-
 def test_the_papers_settings_have_one_window_and_keep_their_bricks():
     from mmpi_ns import config
 
