@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -332,9 +330,3 @@ def test_a_lens_that_cannot_be_is_named_and_more_terms_need_more_evidence():
     points = {n: SimpleNamespace(error=0.5, track=SimpleNamespace(length=lambda: 4)) for n in range(99)}
     points[99] = SimpleNamespace(error=np.inf, track=points[0].track)
     assert fit_error(SimpleNamespace(points3D=points)) == pytest.approx(np.sqrt(0.99 * 0.25 + 0.01 * 16))
-
-
-def test_nothing_of_prepare_waits_for_torch_before_what_moves_is_looked_for():
-    """Importing torch takes seconds and half a gigabyte."""
-    code = "import sys, mmpi_prepare.pipeline; sys.exit('torch' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)

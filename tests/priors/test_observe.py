@@ -13,15 +13,12 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 from tiny_scene import write_colmap
 
-from mmpi_ns.data.checks import say_once
 from mmpi_ns.data.posed_images import PosedImages, posed_images
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors import observe as mmpi_observations
 from mmpi_priors.observe import (
     ENOUGH_KEYPOINTS,
     drop_masked,
-    observe,
-    read_observations,
     tell_poses,
     with_surfaces,
     with_tracks,
@@ -192,23 +189,3 @@ def cloud_outputs() -> Any:
         dataparser_transform=torch.eye(4)[:3],
         dataparser_scale=1.0,
     )
-
-
-def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkeypatch, capsys):
-    say_once.cache_clear()
-    outputs, none = cloud_outputs(), (SimpleNamespace(data=tmp_path), Path("none"))
-    cameras = as_data().cameras
-    waiting = read_observations(outputs, cameras, None)
-    assert waiting.loose is not None and not len(waiting.points)
-    assert waiting.loose == pytest.approx(np.array([[0, 0.1, -3]]), abs=1e-6)
-    monkeypatch.setattr(mmpi_observations, "_find_points", lambda found, *_: found)
-    data = as_data()
-    assert observe(outputs, data, *none, find_points=True, triangulates=True, trusts=False).loose is not None
-    names, seen_point = np.array(outputs.image_filenames), np.zeros(2, int)
-    tracks = SfmModel(np.array([[0.0, 0, -3]]), names, np.arange(2), seen_point, np.full((2, 2), 0.5))
-    monkeypatch.setattr(mmpi_observations, "find_sfm_model", lambda folder: tracks)
-    monkeypatch.setattr(mmpi_observations, "drop_masked", lambda found, data: found)
-    say_once.cache_clear()
-    found = observe(outputs, data, *none, find_points=True, triangulates=True, trusts=False)
-    assert found.loose is None and len(found.points) == 1
-    assert "Point cloud: not used" in capsys.readouterr().out

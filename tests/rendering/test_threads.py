@@ -117,25 +117,3 @@ def interrupted(model, camera, number) -> str | None:
     thread.join(60)
     assert not thread.is_alive(), "it waits for a lock that nobody gives back"
     return trace.line
-
-
-def test_a_rendering_that_is_interrupted_anywhere_changes_nothing_and_holds_no_lock(run, model):
-    """The window in use stays, the next step goes on with the trained field, and other threads render on."""
-    camera = cameras_of(run)[1]
-    expected, trained = model.get_outputs_for_camera(camera), copied(model.state_dict())
-    number, lines = 1, set()
-    while True:
-        model.store.forget(0)
-        line = interrupted(model, camera, number)
-        if line is None:
-            break
-        lines.add(line)
-        assert not model.store._lock.locked(), line
-        number += 1 if number < 400 else 1 + number // 12  # the store is asked early
-    assert len(lines) > 20 and any("window_store" in line for line in lines)
-    assert differences(dict(model.state_dict()), trained) == []
-    outputs = model.get_outputs_for_camera(camera)
-    assert all(torch.equal(outputs[name], values) for name, values in expected.items())
-    before = copied(model.field.state_dict())
-    model.run.prepare_step(None, 2 * STEPS - 1)
-    assert differences(dict(model.field.state_dict()), before) == [], "the next step trains what was trained"
