@@ -15,8 +15,9 @@ from interpreting import by_torch, interpreted, normal  # noqa: F401
 from random_fields import OracleRay, bundle, fill, random_field, random_rays, render, sampled
 from random_scenes import dense_grad
 
+from mmpi_ns import blending
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops import blending, composite
+from mmpi_ns.ops import composite
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import MarchOptions, gpu
 from mmpi_ns.sampler import march, rays_of

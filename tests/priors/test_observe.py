@@ -15,9 +15,7 @@ from tiny_scene import write_colmap
 
 from mmpi_ns.data.posed_images import PosedImages, posed_images
 from mmpi_ns.placement.observations import Observations
-from mmpi_priors import observe as mmpi_observations
 from mmpi_priors.observe import (
-    ENOUGH_KEYPOINTS,
     drop_masked,
     tell_poses,
     with_surfaces,
@@ -103,21 +101,6 @@ def test_tracks_come_in_pixels_of_the_camera_whose_place_names_them():
     assert found.seen_by.tolist() == [0, 1, 1] and found.seen_point.tolist() == [2, 3, 2]
     assert found.seen_at == pytest.approx(np.array([[10, 10], [60, 6], [40, 30]]))
     assert np.array_equal(found.points, np.arange(12.0).reshape(4, 3))
-
-
-@pytest.mark.parametrize(("each", "searched"), [(ENOUGH_KEYPOINTS, False), (ENOUGH_KEYPOINTS - 1, True)])
-def test_surfaces_are_searched_only_where_triangulation_finds_too_few_keypoints(monkeypatch, each, searched):
-    tracks = [(camera, 0, 0.5, 0.5) for camera in (0, 1) for _ in range(each)]
-    monkeypatch.setattr(mmpi_observations, "digest", lambda *parts: "key")
-    monkeypatch.setattr(mmpi_observations, "remembered", lambda key, find: find())
-    monkeypatch.setattr(mmpi_observations, "triangulate", lambda images: model(*tracks))
-    monkeypatch.setattr(mmpi_observations, "at_full_size", lambda images: images)
-    calls = []
-    monkeypatch.setattr(mmpi_observations, "with_surfaces", lambda found, images: calls.append(images) or found)
-    found = mmpi_observations._find_points(bare(), as_data(), True, lambda *_: False)
-    assert len(found.seen_by) == 2 * each and len(calls) == searched
-    mmpi_observations._find_points(bare(), as_data(), False, lambda *_: False)
-    assert len(calls) == searched + 1 and len(calls[-1].files) == 2
 
 
 @pytest.mark.parametrize("depth", [12.0, 120.0])

@@ -367,7 +367,7 @@ def test_a_folder_in_use_is_left_as_it_is(tmp_path, monkeypatch, capsys):
 def test_overwrite_replaces_a_data_set_whole(tmp_path, capsys):
     options = {"width": 32, "height": 24, "points": 40}
     SceneCommand("room", tmp_path / "out", count=4, **options).main()
-    assert f"ns-train mmpi-small --data {tmp_path / 'out'}" in capsys.readouterr().out
+    assert f"ns-train mmpi --data {tmp_path / 'out'}" in capsys.readouterr().out
     with pytest.raises(FileExistsError, match="--overwrite"):
         SceneCommand("object", tmp_path / "out", count=3, **options).main()
     assert len(list((tmp_path / "out" / "images").iterdir())) == 4
