@@ -132,8 +132,7 @@ def all_launches(setattr, shapes=SMALL):
     setattr(dispatch, "fault", lambda *_: None)
     with launches_noted({}) as noted:
         for name, cases in kernel_cases.CASES.items():
-            home = dispatch.OPERATIONS[name].__module__
-            module = importlib.import_module(f"{'mmpi_ns.ops.march' if home == 'mmpi_ns.sampler' else home}.gpu")
+            module = importlib.import_module(f"{dispatch.OPERATIONS[name].kernels}.gpu")
             if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
                 setattr(module, "block_size", lambda wanted, device: wanted)
             for given in cases("cpu", shapes):
