@@ -150,7 +150,7 @@ def test_the_last_line_is_a_command_to_copy(tmp_path, capsys):
     scene = tmp_path / ("a [long] name " * 9).strip()
     prepare(Settings(tmp_path / "frames", scene, focal=corridor.FOCAL, threads=1))
     *_, last = capsys.readouterr().out.splitlines()
-    assert shlex.split(last) == ["ns-train", "mmpi-small", "--data", str(scene)]
+    assert shlex.split(last) == ["ns-train", "mmpi", "--data", str(scene)]
     assert (scene / "transforms.json").is_file() and not (scene / WORK).exists()
 
 

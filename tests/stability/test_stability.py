@@ -13,7 +13,8 @@ from stability import rays as cases_rays
 from stability.cases import PRECISIONS, Error, compare
 from stability.table import EVERY
 
-from mmpi_ns.ops import blending, composite
+from mmpi_ns import blending
+from mmpi_ns.ops import composite
 from mmpi_ns.scene import geometry
 
 FLOAT32 = PRECISIONS[0]
