@@ -107,11 +107,11 @@ def triangulate(images: PosedImages) -> SfmModel:
                 error = _epipolar_error(database, model)
                 model = sfm.triangulate_points(model, database, work, pairs_alone=True)
             tracks = read_reconstruction(model, MIN_TRACK)
-            posed = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
-            if not error <= FINE and len(names) > 1:
-                # Poses that are wrong name wrong neighbours: images that follow each other are evidence beside them.
-                sfm.match_pairs(database, [(a, b) for k in (1, 2) for a, b in zip(names, names[k:], strict=False)])
-            matches = Matches.of(posed, database)
+        posed = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
+        if not error <= FINE and len(names) > 1:
+            # Poses that are wrong name wrong neighbours: images that follow each other are evidence beside them.
+            sfm.match_pairs(database, [(a, b) for k in (1, 2) for a, b in zip(names, names[k:], strict=False)])
+        matches = Matches.of(posed, database)
     assert tracks is not None and matches is not None
     table = np.concatenate([matches.images, *(x.reshape(-1, 4) for x in (matches.rays, matches.flat))], -1)
     order = np.array([str(names.index(name)) for name in tracks.names], np.str_)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from importlib.metadata import version
 from typing import Any
@@ -32,4 +33,7 @@ def run(name: str, command: Any, **how: Any) -> int:
     except (ValueError, OSError) as error:
         print(f"{name}: {used_up(error) or error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print(f"{name}: Interrupted.", file=sys.stderr)
+        return 128 + signal.SIGINT
     return 0

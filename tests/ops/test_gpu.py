@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from types import SimpleNamespace
@@ -62,6 +63,23 @@ def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
     assert {"march_kernel", "show_kernel", "gather_kernel", "variation_kernel"} < {x.name for x in launches}
     for launch in launches:
         assert not spills(launch.compiled(90)), (launch.name, launch.constants)
+
+
+@needs_triton
+def test_the_tables_of_kernels_are_what_they_compile_to(monkeypatch):
+    """Two rows of docs/results/kernels.json, which tests/triton_compiling.py --write makes; in none registers spill."""
+    import triton
+    from triton_compiling import launches_of_plans, measured, page
+
+    content = json.loads((TABLE := HERE.parent / "docs/results/kernels.json").read_text(encoding="utf-8"))
+    assert TABLE.with_suffix(".md").read_text(encoding="utf-8") == page(content)
+    assert content["headline"]["spilling"] == 0
+    if triton.__version__ != content["made"]["triton"]:
+        pytest.skip(f"the table is of Triton {content['made']['triton']}")
+    plans = {str(number): launches for number, launches in launches_of_plans(monkeypatch.setattr).items()}
+    assert {n: set(rows) for n, rows in plans.items()} == {n: set(rows) for n, rows in content["plans"].items()}
+    for number, name in (("4", "gather_back_kernel"), ("64", "variation_kernel")):
+        assert measured(plans[number][name], 90) == content["plans"][number][name]["sm_90"]
 
 
 @pytest.mark.parametrize(

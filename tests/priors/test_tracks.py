@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from value_noise import noise
 
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
+from mmpi_priors import tracks as triangulation
 from mmpi_priors.observe import with_tracks
-from mmpi_priors.tracks import NEIGHBOURS, near_pairs, triangulate
+from mmpi_priors.tracks import EFFORTS, NEIGHBOURS, near_pairs, triangulate
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 180.0
 LENS = (0.05, -0.02, 0.001, -0.002)
@@ -136,6 +138,32 @@ def test_perspective_and_fisheye_images_are_matched_with_each_other(tmp_path):
     cameras, points, _ = keypoints_of(found, both)
     mixed = [len(set(is_fisheye[cameras[points == p]])) == 2 for p in range(len(found.points))]
     assert np.mean(mixed) > 0.5
+
+
+def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, images, monkeypatch):
+    efforts, faintest = [], []
+    extract, match = pycolmap.extract_features, pycolmap.match_image_pairs
+
+    def spy_extract(*args, extraction_options, **options):
+        faintest.append(extraction_options.sift.peak_threshold)
+        return extract(*args, extraction_options=extraction_options, **options)
+
+    def spy_match(*args, matching_options, verification_options, **options):
+        efforts.append((faintest[-1], matching_options.guided_matching, verification_options.min_num_inliers))
+        options |= {"matching_options": matching_options, "verification_options": verification_options}
+        return match(*args, **options)
+
+    monkeypatch.setattr(pycolmap, "extract_features", spy_extract)
+    monkeypatch.setattr(pycolmap, "match_image_pairs", spy_match)
+    faint = scene_of(tmp_path, POSES[:4], contrast=0.12)
+    points = triangulate(faint).points
+    assert efforts == list(EFFORTS) and len(faintest) == len(EFFORTS) and np.median(depth_error(points)) < 0.02
+    monkeypatch.setattr(triangulation, "EFFORTS", EFFORTS[:1])
+    assert len(triangulate(faint).points) < 0.5 * len(points)
+    monkeypatch.setattr(triangulation, "EFFORTS", (EFFORTS[1], EFFORTS[0]))
+    efforts.clear()
+    triangulate(images)
+    assert efforts == [EFFORTS[1]]
 
 
 def keypoints_of(model, images):

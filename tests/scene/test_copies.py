@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from bricked import bricked_field, chance
+from bricked import big_plan, bricked_field, chance
 from random_fields import bundle, compare, random_rays, render, sampled
 
+from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import RELEASED_DENSITY
 from mmpi_ns.ops import dispatch
 from mmpi_ns.scene.bricks import tiles_with_copies
@@ -77,6 +78,15 @@ def test_rays_through_copies_look_as_the_oracle_says(monkeypatch, route):
     field = bricked_field()
     field.copy_finely(some_tiles(field, 0.5))
     assert compare(field, *random_rays(field.plan, 12, seed=5), blends=False) >= 8
+
+
+def test_a_state_with_copies_comes_back():
+    written, read = bricked_field(), MMPIField(big_plan(4), feature_channels=5, hidden_width=6)
+    written.copy_finely(some_tiles(written, 0.5))
+    read.load_state_dict(written.state_dict())
+    assert read.copied and read.plan == written.plan and read.full_plan == written.full_plan
+    for name, values in written.state_dict().items():
+        assert torch.equal(values, read.state_dict()[name]), name
 
 
 def test_the_gain_of_a_brick_is_what_its_samples_weigh_times_the_errors_of_their_rays():

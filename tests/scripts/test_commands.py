@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from importlib.metadata import entry_points
@@ -221,3 +222,11 @@ def test_render_writes_every_output_of_the_test_images(command, run_folder, tmp_
     assert all(resembles(picture(f), i) for f, i in zip(found, TEST, strict=True))
     truth = picture(sorted((tmp_path / "out" / "test" / "gt-rgb").iterdir())[0])
     assert np.abs(truth - image_of(TEST[0])).max() < 0.01
+
+
+def test_commands_of_ours_are_interrupted_without_a_traceback(tmp_path):
+    running = start("mmpi-scene", "street", tmp_path / "street")
+    running.wait_for("looking for points")
+    running.send(signal.SIGINT)
+    ended = running.end()
+    assert ended.status == 130 and ended.error.strip() == "mmpi-scene: Interrupted."
