@@ -62,6 +62,9 @@ def find_sfm_model(path: Path) -> SfmModel | None:
         return None
     try:
         cameras, images, points = cast(Any, read_model(str(path)))
+        seen_by = np.unique(np.concatenate([[], *(p.image_ids for p in points.values())]))
+        if not np.isin(seen_by, list(images)).all():
+            raise LookupError("its points are seen by images that it lacks")
         images = [image for _, image in sorted(images.items())]
         sizes = [(cameras[image.camera_id].width, cameras[image.camera_id].height) for image in images]
     except (ValueError, TypeError, OSError, LookupError, MemoryError, AssertionError, struct.error) as error:
