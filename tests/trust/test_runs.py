@@ -334,3 +334,48 @@ def test_mmpi_export_names_a_config_that_is_none(finished, text):
 def test_a_checkpoint_file_that_is_not_there_is_said(whole_scene, tmp_path):
     said = train(whole_scene, tmp_path, load_checkpoint=tmp_path / "no.ckpt").sentence
     assert "There is no checkpoint at" in said and "--load-checkpoint" in said
+
+
+def test_a_checkpoint_cannot_run_code(whole_scene, finished, tmp_path):
+    path = finished / "nerfstudio_models" / "step-000000005.ckpt"
+    torch.save(torch.load(path, weights_only=True) | {"scalers": Runs(tmp_path / "ran")}, path)
+    assert str(path) in train(whole_scene, tmp_path / "new", load_dir=path.parent).sentence
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_resumed_run_passes_over_stray_files_among_checkpoints(whole_scene, littered, tmp_path):
+    said = train(whole_scene, tmp_path / "new", load_dir=littered / "nerfstudio_models", max_num_iterations=6).shown
+    assert "nothing to do" in said
+
+
+def test_evaluation_of_a_capture_that_has_gone_is_one_sentence(whole_scene, tmp_path):
+    data = shutil.copytree(whole_scene, tmp_path / "gone")
+    assert train(data, tmp_path).status == 0
+    shutil.rmtree(data)
+    said = evaluate(folder_of(tmp_path), tmp_path).sentence
+    assert f"There is no {data / 'transforms.json'}: check --data" in said
+
+
+@pytest.mark.parametrize("command", ["ns-eval", "mmpi-export"])
+def test_a_capture_by_a_relative_path_of_another_folder_is_told(finished, tmp_path, command):
+    config = yaml.load((finished / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.data = Path("captures/tiny")  # as ns-train wrote it once
+    (finished / "config.yml").write_text(yaml.dump(config))
+    output = ["--output-path", tmp_path / "eval.json"] if command == "ns-eval" else ["--output", tmp_path / "out"]
+    words = (command, *(["bake"] if command == "mmpi-export" else []), "--load-config", finished / "config.yml")
+    said = run(*words, *output).sentence
+    assert said.startswith(f"There is no captures/tiny/transforms.json in {Path.cwd()}, from where the path is seen")
+
+
+def test_a_run_ends_with_a_quick_test_and_commands_that_can_be_copied(whole_scene, tmp_path):
+    ended = train(whole_scene, tmp_path, max_num_iterations=12)
+    lines = ended.out.splitlines()
+    config = folder_of(tmp_path) / "config.yml"
+    first = next(i for i, line in enumerate(lines) if line.startswith("Capture: 6 training and 2 test images of 32 x"))
+    assert lines[first + 1].startswith("Scene plan") and any(x.startswith("Memory") for x in lines[first:])
+    assert any(x.startswith("step 12 of 12 | joint | ") and "rays/s | batch PSNR" in x for x in lines), lines
+    end = next(i for i, line in enumerate(lines) if line.startswith("Training finished: 12 steps in"))
+    assert lines[end + 1].startswith("Quick test on 2 of 2 test images: PSNR ") and "SSIM" in lines[end + 1]
+    assert lines[end + 2] == f"The run is in {config.parent}. Next:"
+    names = [line.split()[0] for line in lines[end + 3 :]]
+    assert names == ["ns-eval", "ns-render", "ns-viewer"] and all(f" {config}" in x for x in lines[end + 3 :])
