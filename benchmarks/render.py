@@ -107,8 +107,7 @@ class Render(Bench):
         facts = {"exact": exact, "default": default.name, "device": str(model.device)}
         report.content |= {**facts, "pixels": int(images[0][1].shape[0] * images[0][1].shape[1])}
         report.save()
-        bakes = model.field.shading == "ray" and model.field.plan.cube is None
-        wanted = [s for s in self._settings(default, bakes) if s.name not in report.rows]
+        wanted = [s for s in self._settings(default) if s.name not in report.rows]
         for number in range(self.rounds if wanted else 0):
             for setting in wanted:
                 row = report.rows.setdefault(setting.name, {**asdict(setting), "frame_s": []})
@@ -120,16 +119,14 @@ class Render(Bench):
         report.finish(head, markdown(report.content, head), lambda path: draw(path, report.content))
         print(head)
 
-    def _settings(self, default: Setting, bakes: bool) -> list[Setting]:
-        """The default, then one thing at a time, every threshold under every ops, and baked where that can be done."""
+    def _settings(self, default: Setting) -> list[Setting]:
+        """The default, then one thing at a time, and every threshold under every ops."""
         found = [default]
         found += [Setting(t, default.chunk, default.ops) for t in self.thresholds]
         found += [Setting(default.threshold, c, default.ops) for c in self.chunks]
         if default.ops in self.ops:  # elsewhere than on a CPU there is one path
             found += [Setting(t, default.chunk, ops) for ops in self.ops for t in (default.threshold, 0.0)]
         found += [Setting(default.threshold, default.chunk, default.ops, a) for a in self.also]
-        if bakes:
-            found.append(Setting(default.threshold, default.chunk, default.ops, "rendering.mode=baked"))
         return list(dict.fromkeys(found))
 
 

@@ -9,7 +9,6 @@ from mmpi_ns.bench.trainers import JOINT, P
 DRIVE = (P + "arrangement", "drive")
 BY_HAND = (*DRIVE, *JOINT)
 FRONT = (*BY_HAND, P + "faces", "front")
-NOT_PULLED = (P + "drive-pull-back", "0")
 EQUAL_SHARES = ("--optimizers.reliability.optimizer.lr", "1e-9")
 LITTLE_VARIATION = ("--pipeline.model.loss.tv-density", "1e-5", "--pipeline.model.loss.tv-features", "1e-6")
 """DVGO's."""
@@ -19,14 +18,9 @@ ROOM = (P + "arrangement", "room", P + "width", "160", *JOINT)
 ROOM_CUBE = (*ROOM, P + "cube-voxels", "96")
 
 
-def _shares(blend: float, finetune: float = 0.0, rate: float = 1.0) -> tuple[str, ...]:
-    shares = (
-        "--pipeline.model.schedule.blend-share",
-        str(blend),
-        "--pipeline.model.schedule.finetune-share",
-        str(finetune),
-    )
-    return (*shares, "--pipeline.model.schedule.finetune-rate", str(rate)) if finetune else shares
+def _shares(blend: float, finetune: float = 0.0) -> tuple[str, ...]:
+    names = ("--pipeline.model.schedule.blend-share", "--pipeline.model.schedule.finetune-share")
+    return names[0], str(blend), names[1], str(finetune)
 
 
 ALONE = (*DRIVE, *TWO_PHASE, *_shares(0.25))
@@ -41,11 +35,10 @@ def _group(name: str, rows: dict[str, tuple[str, ...]], steps: int = 750) -> lis
 def _paper_ladder(group: str, extra: tuple[str, ...]) -> list[Method]:
     """Single, joint, two phases: the paper's ablation on the hand-made drive, with SfM depth in all rows or in none."""
     rows = {
-        "one front MPI at the first camera": (*FRONT, *NOT_PULLED),
         "one front MPI, pulled back": FRONT,
         "four MPIs, joint, no reliability": BY_HAND,
         "four MPIs, individual, then reliability only": (*DRIVE, *TWO_PHASE, *SPLIT, *_shares(0.25)),
-        "... then a joint fine-tune": (*DRIVE, *TWO_PHASE, *SPLIT, *_shares(0.1, 0.4, 0.3)),
+        "... then a joint fine-tune": (*DRIVE, *TWO_PHASE, *SPLIT, *_shares(0.1, 0.4)),
         "four MPIs, two phases as by default": (*DRIVE, *TWO_PHASE),
         "automatic placement, joint": (*JOINT, P + "texel-pixels", "1.5"),
     }
@@ -54,7 +47,7 @@ def _paper_ladder(group: str, extra: tuple[str, ...]) -> list[Method]:
 
 def _budgets(*millions: float) -> list[Method]:
     """Automatic placement held to so many texels, with nothing else that keeps them few, and as it is."""
-    free = (P + "rays-per-texel", "0", P + "texels-per-ray", "0", P + "max-texels")
+    free = (P + "rays-per-texel", "0", P + "max-texels")
     return _group("", {f"{m:g} M texels": (*free, f"{m * 1e6:g}") for m in millions} | {DEFAULT: ()}, 1500)
 
 
@@ -84,7 +77,6 @@ SUITES: dict[str, list[Method]] = {
         "",
         {
             "MPIs placed automatically": (),
-            "... and a cube where placement finds it worth it": (P + "max-voxels", "128"),
         },
         1500,
     ),
@@ -123,7 +115,7 @@ ABLATIONS: dict[str, list[Method]] = {
                 "one front MPI, pulled back": FRONT,
                 "each alone, then reliability": (*ALONE, *SPLIT),
                 "... every MPI sees all rays (30k each)": ALONE,
-                "... then a joint fine-tune": (*DRIVE, *TWO_PHASE, *SPLIT, *_shares(0.1, 0.4, 0.3)),
+                "... then a joint fine-tune": (*DRIVE, *TWO_PHASE, *SPLIT, *_shares(0.1, 0.4)),
                 "... a longer one, at full rates": (*DRIVE, *TWO_PHASE, *SPLIT),
                 "... and every MPI sees all rays (the default)": (*DRIVE, *TWO_PHASE),
                 "... with equal shares instead of reliability": (*DRIVE, *TWO_PHASE, *EQUAL_SHARES),
@@ -132,8 +124,6 @@ ABLATIONS: dict[str, list[Method]] = {
         *_group(  # what we added or chose, one change at a time
             "changes of the reference",
             {
-                "one front MPI, at the first camera": (*FRONT, *NOT_PULLED),
-                "four MPIs, the front one not pulled back": (*BY_HAND, *NOT_PULLED),
                 "no SfM depth": (*BY_HAND, *NO_DEPTH),
             },
         ),
@@ -143,7 +133,7 @@ ABLATIONS: dict[str, list[Method]] = {
                 "placed among the cameras, joint": JOINT,
                 "placed, no SfM depth": (*JOINT, *NO_DEPTH),
                 "placed, a tenth of the total variation": (*JOINT, *LITTLE_VARIATION),
-                "placed, each alone, reliability, fine-tune": (*TWO_PHASE, *SPLIT, *_shares(0.1, 0.4, 0.3)),
+                "placed, each alone, reliability, fine-tune": (*TWO_PHASE, *SPLIT, *_shares(0.1, 0.4)),
                 "placed, two phases as by default": TWO_PHASE,
             },
         ),

@@ -7,7 +7,7 @@ Source: paper sec. III-C ("two-stage reliability learning scheme") and sec. IV (
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import accumulate, pairwise
 from typing import Literal
 
@@ -161,6 +161,8 @@ class Schedule:
     @staticmethod
     def from_json(text: str) -> Schedule:
         data = json.loads(text)
+        if left := sorted(set(data) - {f.name for f in fields(Schedule)}):
+            raise InputError(f"The run is of an earlier version ({', '.join(left)} of its schedule left): train again.")
         phases = tuple(Phase(**p) for p in data.pop("phases"))
         lists = {name: tuple(data.pop(name, ())) for name in ("growth", "release")}
         return Schedule(phases=phases, **lists, **data)
