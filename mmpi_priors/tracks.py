@@ -86,7 +86,7 @@ def triangulate(images: PosedImages) -> SfmModel:
     options.max_image_size = LARGE
     options.sift.first_octave = -1 if images.sizes.max() <= SMALL else 0
     with sfm.quiet(), tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
-        work = Path(folder)
+        work = database = Path(folder)
         names = _gathered(images.files, work)
         pairs = [(names[i], names[j]) for i, j in near_pairs(images.camera_to_worlds, NEIGHBOURS)]
         opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
