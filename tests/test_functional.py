@@ -155,8 +155,8 @@ def test_examples_of_the_documentation_run(page, number, run, baked, tmp_path, m
     assert len(code.splitlines()) <= 12
     monkeypatch.chdir(tmp_path)
     Path("site").symlink_to(baked)
-    Path("outputs/scene/mmpi-small").mkdir(parents=True)
-    Path("outputs/scene/mmpi-small/run").symlink_to(run.parent)
+    Path("outputs/scene/mmpi").mkdir(parents=True)
+    Path("outputs/scene/mmpi/run").symlink_to(run.parent)
     exec(compile(code, page, "exec"), {})
     pictures = list(Path().glob("*.png"))
     assert pictures and all(np.asarray(Image.open(path)).std() > 3 for path in pictures)

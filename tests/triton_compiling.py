@@ -5,31 +5,23 @@ that by compiling each kernel once, with the most in it):
 
     pip install --no-deps --target triton-3.1 triton==3.1.0
     PYTHONPATH=triton-3.1:.:tests python tests/triton_compiling.py 75 80 86 89 90
-
-Registers, shared memory, occupancy and traffic of every kernel (docs/results/kernels.md):
-
-    PYTHONPATH=.:tests python tests/triton_compiling.py 80 86 89 90 --write docs/results/kernels.json
 """
 
 from __future__ import annotations
 
 import importlib
-import json
-import re
 import subprocess
 import sys
 import tempfile
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from itertools import accumulate
-from operator import mul
+from dataclasses import dataclass
 from pathlib import Path
 
 import kernel_cases
 import torch
 import triton
-from kernel_cases import SMALL, Shapes
+from kernel_cases import SMALL
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
@@ -58,8 +50,6 @@ class Launch:
     signature: tuple[tuple[str, str], ...]
     constants: tuple[tuple[str, object], ...]
     num_warps: int
-    bytes_per_item: float = field(default=0.0, compare=False)
-    """Of the arrays with an entry for each ray, sample or row that the kernel works on."""
 
     @property
     def name(self):
@@ -82,17 +72,6 @@ def _type(value):
     return "fp32" if isinstance(value, float) else "i64" if abs(value) >= 2**31 else "i32"
 
 
-def _bytes_per_item(given):
-    """Of a launch, by its arguments: each entry of the arrays that have some for every item, and those alone."""
-    count = next((given[name] for name in ("size", "count", "num_rays") if name in given), 0)
-
-    def is_for_items(x):
-        return count in accumulate(x.shape, mul) or x.shape == (2 * count,)
-
-    arrays = {x.data_ptr(): x for x in given.values() if isinstance(x, torch.Tensor) and is_for_items(x)}
-    return sum(x.numel() * x.element_size() for x in arrays.values()) / max(1, count)
-
-
 @contextmanager
 def launches_noted(noted):
     """Within, a launch is added to ``noted`` (a dict, for its order) and runs nothing.
@@ -106,10 +85,9 @@ def launches_noted(noted):
         given = dict(zip(self.arg_names, args, strict=False))
         # As a launch does: an integer of 1 becomes a constant.
         ones = {n: 1 for n, v in given.items() if type(v) is int and v == 1 and n not in self.do_not_specialize}
-        moved = _bytes_per_item(given)
         given = {name: _type(value) for name, value in given.items() if name not in ones}
         constants |= ones
-        noted[Launch(self, tuple(given.items()), tuple(constants.items()), num_warps, moved)] = None
+        noted[Launch(self, tuple(given.items()), tuple(constants.items()), num_warps)] = None
         for value in args:
             if isinstance(value, torch.Tensor):
                 value.detach().zero_()
@@ -168,103 +146,6 @@ def spills(kernel):
     return "STACK:0" not in found and "REG:255" in found
 
 
-WARPS = {80: 64, 86: 48, 89: 48, 90: 64}
-"""That a multiprocessor holds at most,"""
-PROGRAMS = {80: 32, 86: 16, 89: 24, 90: 32}
-"""programs,"""
-SHARED = {80: 164, 86: 100, 89: 100, 90: 228}
-"""and KiB of shared memory, of which each program takes one more than it asks for."""
-REGISTERS = 65536
-BANDWIDTH = {80: 2039e9, 86: 936e9, 89: 1008e9, 90: 3350e9}
-"""Bytes a second of an A100 80 GB, RTX 3090, RTX 4090 and H100 SXM (their makers' figures)."""
-PLANS = {n: Shapes((n,), cube=False, blends=False) for n in (4, 9, 64)}
-"""Not blended, eight channels: by the number of MPIs."""
-
-
-def launches_of_plans(setattr):
-    """The launches in the table, by number of MPIs and name: of larger plans those that smaller ones do not have."""
-    seen, plans = set(), {}
-    for number, shapes in PLANS.items():
-        launches = largest_launches(all_launches(setattr, shapes))
-        plans[number] = {name: launch for name, launch in launches.items() if launch not in seen}
-        seen |= set(launches.values())
-    return plans
-
-
-def occupancy(registers, shared, warps, architecture):
-    """Warps of a kernel that a multiprocessor has at a time, and the share of those that it could have."""
-    per_warp = -(-registers * 32 // 256) * 256
-    programs = min(PROGRAMS[architecture], WARPS[architecture] // warps, REGISTERS // per_warp // warps,
-                   int(SHARED[architecture] * 1024 // (shared + 1024)))  # fmt: skip
-    return programs * warps, programs * warps / WARPS[architecture]
-
-
-def measured(launch, architecture):
-    """A row of the table."""
-    kernel = launch.compiled(architecture)
-    said = resources(kernel)
-    registers, stack = (int(re.search(rf"{name}:(\d+)", said)[1]) for name in ("REG", "STACK"))
-    warps, share = occupancy(registers, kernel.metadata.shared, launch.num_warps, architecture)
-    row = {"registers": registers, "shared": kernel.metadata.shared, "stack": stack, "warps": warps}
-    row |= {"spills": spills(kernel), "occupancy": round(share, 2)}
-    bytes_per_item = round(launch.bytes_per_item, 1)
-    roof = round(BANDWIDTH[architecture] / bytes_per_item / 1e6) if bytes_per_item else None
-    return row | {"bytes_per_item": bytes_per_item, "million_items_per_s": roof}
-
-
-def write_table(path, architectures):
-    """Writes what every kernel takes on every architecture, as JSON and, beside it, as a page."""
-    plans, commit = {}, ["git", "rev-parse", "--short", "HEAD"]
-    made = {"command": " ".join(["python", *sys.argv]), "triton": triton.__version__}
-    made["shapes"] = PLANS[4]._asdict() | {"mpis": list(PLANS)}
-    made["commit"] = subprocess.run(commit, capture_output=True, text=True, check=True).stdout.strip()
-    made["date"] = time.strftime("%Y-%m-%d")
-    for number, launches in launches_of_plans(setattr).items():
-        rows = plans[str(number)] = {}
-        for name, launch in launches.items():
-            rows[name] = {f"sm_{a}": measured(launch, a) for a in architectures}
-            print(number, name, rows[name], flush=True)
-    spilling = sum(cell["spills"] for rows in plans.values() for row in rows.values() for cell in row.values())
-    headline = {"kernels": len(plans["4"]), "spilling": spilling}
-    content = {"headline": headline, "made": made, "plans": plans}
-    path.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    path.with_suffix(".md").write_text(page(content), encoding="utf-8")
-
-
-def page(content):
-    """The tables as a page."""
-    names = list(next(iter(content["plans"]["4"].values())))
-    lines = [
-        "# What the GPU's kernels take", "",
-        "From their compiled form, without a device: `PYTHONPATH=.:tests python tests/triton_compiling.py "
-        f"{' '.join(n.removeprefix('sm_') for n in names)} --write docs/results/kernels.json` (Triton "
-        f"{content['made']['triton']}, the launch of each kernel with the most in it, not blended, eight channels; the "
-        "march and pictures of 6 planes an MPI).", "",
-        "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
-        "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "
-        "read or written once; what kernels look up in tables comes on top. The roof is the memory's bandwidth over "
-        "these bytes. The march takes fewer rays a program where there are many heads.",
-    ]  # fmt: skip
-    for number, rows in content["plans"].items():
-        title = f"## {number} MPIs" if number == "4" else f"## {number} MPIs, where that changes a kernel"
-        lines += ["", title, "", *_table(rows, names)]
-    return "\n".join(lines) + "\n"
-
-
-def _table(rows, names):
-    lines = [
-        "| kernel | " + " | ".join(names) + " | spills | bytes an item | roof, A100 / H100, million items/s |",
-        "|---|" + "---|" * (len(names) + 3),
-    ]
-    for name, row in rows.items():
-        cells = [f"{row[n]['registers']} / {row[n]['shared']} / {100 * row[n]['occupancy']:.0f} %" for n in names]
-        spilling = [n for n in names if row[n]["spills"]]
-        roofs = " / ".join(f"{row[n]['million_items_per_s'] or '-'}" for n in ("sm_80", "sm_90") if n in row)
-        cells += [", ".join(spilling) or "none", str(row[names[0]]["bytes_per_item"]), roofs]
-        lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    return lines
-
-
 def main(architectures, largest):
     """Compiles all, or the largest of each kernel, and says what does not compile."""
     launches, failed = all_launches(setattr), 0
@@ -286,7 +167,4 @@ def main(architectures, largest):
 
 
 if __name__ == "__main__":
-    if "--write" in sys.argv:
-        place = Path(sys.argv[sys.argv.index("--write") + 1])
-        sys.exit(write_table(place, [int(word) for word in sys.argv[1:] if word.isdigit()] or list(WARPS)))
     sys.exit(main([int(word) for word in sys.argv[1:] if word.isdigit()] or ARCHITECTURES, "--largest" in sys.argv))

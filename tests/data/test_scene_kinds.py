@@ -10,7 +10,6 @@ import pytest
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
-from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.scannet_dataparser import ScanNetDataParserConfig
 from PIL import Image
@@ -129,6 +128,7 @@ def blender(data, alpha_color="white"):
 
 def scannet(data):
     """ScanNet's folders, with depths along the optical axis in millimetres."""
+    pytest.importorskip("open3d", reason="nerfstudio's ScanNet parser needs it", exc_type=ImportError)
     for name in ("color", "depth", "pose", "intrinsic"):
         (data / name).mkdir()
     camera = [[FOCAL, 0, WIDTH / 2, 0], [0, FOCAL, HEIGHT / 2, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -198,28 +198,9 @@ def test_the_only_test_image_of_instant_ngp_is_named(tmp_path):
     assert two.eval_dataset.cameras.shape == (2,)
 
 
-@pytest.mark.parametrize(
-    ("parser", "what"),
-    [
-        (BlenderDataParserConfig(), "Blender cannot read the train images .*transforms_train.json"),
-        (InstantNGPDataParserConfig(eval_mode="filename"), "InstantNGP .*ValueError: frame should contain train/eval"),
-        (MinimalDataParserConfig(), "MinimalDataParser cannot read the train images .*train.npz"),
-    ],
-)
-def test_what_another_data_parser_cannot_read_is_one_sentence(tmp_path, parser, what):
-    data = write_scene(tmp_path / "data")
-    with pytest.raises(InputError, match=f"nerfstudio's data parser {what}.*check --data, the files there and"):
-        datamanager(data, dataparser=parser)
-
-
 def test_missing_test_images_are_named_before_the_training_images_are_matched(tmp_path, capsys):
     data = write_scene(tmp_path / "data", sfm=False)
     (data / "images" / name_of(TEST[1])).unlink()
     with pytest.raises(InputError, match=f"Image .*{name_of(TEST[1])} cannot be read"):
         datamanager(data)
-    (data / "colmap").mkdir()
-    parser = blender(data)
-    (data / "transforms_val.json").unlink()
-    with pytest.raises(InputError, match=r"cannot read the val images .*transforms_val.json"):
-        datamanager(data, dataparser=parser)
     assert "matching" not in capsys.readouterr().out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from types import SimpleNamespace
@@ -63,36 +62,6 @@ def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
     assert {"march_kernel", "show_kernel", "gather_kernel", "variation_kernel"} < {x.name for x in launches}
     for launch in launches:
         assert not spills(launch.compiled(90)), (launch.name, launch.constants)
-
-
-@needs_triton
-def test_the_tables_of_kernels_are_what_they_compile_to(monkeypatch):
-    """Two rows of docs/results/kernels.json, which tests/triton_compiling.py --write makes; in none registers spill."""
-    import triton
-    from triton_compiling import launches_of_plans, measured, page
-
-    content = json.loads((TABLE := HERE.parent / "docs/results/kernels.json").read_text(encoding="utf-8"))
-    assert TABLE.with_suffix(".md").read_text(encoding="utf-8") == page(content)
-    assert content["headline"]["spilling"] == 0
-    if triton.__version__ != content["made"]["triton"]:
-        pytest.skip(f"the table is of Triton {content['made']['triton']}")
-    plans = {str(number): launches for number, launches in launches_of_plans(monkeypatch.setattr).items()}
-    assert {n: set(rows) for n, rows in plans.items()} == {n: set(rows) for n, rows in content["plans"].items()}
-    for number, name in (("4", "gather_back_kernel"), ("64", "variation_kernel")):
-        assert measured(plans[number][name], 90) == content["plans"][number][name]["sm_90"]
-
-
-@pytest.mark.parametrize(
-    ("registers", "shared", "warps", "architecture", "at_a_time"),
-    [(64, 0, 1, 90, 32), (253, 0, 1, 90, 8), (253, 0, 4, 80, 8), (32, 0, 4, 86, 48), (32, 48 * 1024, 4, 90, 16)],
-)
-def test_occupancy_is_bounded_by_registers_programs_warps_and_shared_memory(
-    registers, shared, warps, architecture, at_a_time
-):
-    pytest.importorskip("triton")
-    from triton_compiling import occupancy
-
-    assert occupancy(registers, shared, warps, architecture)[0] == at_a_time
 
 
 @needs_triton

@@ -10,7 +10,7 @@ from reprojection import median_reprojection_error
 
 from mmpi_ns.placement.errors import mpi_errors, pixel_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
-from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.placement.rule import PlacementConfig, place, texel_limits
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 FOCAL, WIDTH, HEIGHT = 180.0, 310.0, 94.0
@@ -117,11 +117,13 @@ def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
     fine, enough, short = (place(observations, config, rays) for rays in (None, 10 * pixels, pixels // 10))
     assert [m.width for m in enough.mpis] == [m.width for m in fine.mpis]
     tangents = short.mpis[0].extent[1] - short.mpis[0].extent[0]
-    # Five rays for the footprint of a texel, where every pixel has a tenth of a ray and several images see the same.
-    sharing = pixels_per_pixel(observations, find_visible_points(observations))
-    assert 3 < sharing < len(observations.centers)
     spans = tangents * FOCAL / (short.mpis[0].width - 1)
-    assert spans == pytest.approx((5 / (0.1 * sharing)) ** 0.5, rel=0.02)
+    visible = find_visible_points(observations)
+    # Five rays for the footprint of a texel, where every pixel has a tenth of a ray and several images see the same.
+    sharing = pixels_per_pixel(observations, visible)
+    assert 3 < sharing < len(observations.centers)
+    trainable, _ = texel_limits(observations, visible, config, pixels // 10)
+    assert trainable == pytest.approx((5 / (0.1 * sharing)) ** 0.5, rel=0.02) and spans >= trainable
     assert f"a texel spans {spans:.1f} pixels: finer with more steps" in short.origin_of_plan
 
 

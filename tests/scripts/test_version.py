@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PYPROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 VERSION = re.findall(r'^version = "(.*)"', PYPROJECT, re.MULTILINE)[0]
-COMMANDS = re.findall(r'^(mmpi-\w+) = "mmpi_(?:ns\.scripts|scene)', PYPROJECT, re.MULTILINE)
+COMMANDS = re.findall(r'^(mmpi-\w+) = "mmpi_\w+\.(?:__main__|scripts)', PYPROJECT, re.MULTILINE)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from concurrent.futures import Future
 from threading import Thread
 
@@ -14,9 +13,7 @@ from mmpi_ns.utils import parallel
 
 
 @pytest.fixture
-def three_threads(monkeypatch):
-    assert not parallel._Apart.blocks, "an earlier test left a block"
-    monkeypatch.setattr(parallel._Apart, "threads", 0)
+def three_threads():
     torch.set_num_threads(3)
     yield
     torch.set_num_threads(1)
@@ -36,29 +33,6 @@ def test_a_failure_gives_the_threads_back(three_threads):
     with pytest.raises(KeyError), parallel.torch_apart():
         raise KeyError
     assert torch.get_num_threads() == 3
-
-
-@pytest.mark.parametrize("line", range(20))
-def test_an_interruption_before_any_line_gives_the_threads_back(three_threads, line):
-    """As the viewer interrupts a rendering: by a trace function that raises, once."""
-    lines = iter(range(line, -1, -1))
-
-    def trace(frame, event, _):
-        if event == "line" and frame.f_code.co_filename == parallel.__file__ and next(lines) == 0:
-            raise KeyError
-        return trace
-
-    before, interrupted = sys.gettrace(), False
-    try:
-        sys.settrace(trace)
-        with parallel.torch_apart():
-            pass
-    except KeyError:
-        interrupted = True
-    finally:
-        sys.settrace(before)
-    assert not parallel._Apart.blocks and torch.get_num_threads() == 3
-    assert interrupted == (next(lines, None) is None)
 
 
 def test_a_thread_that_began_within_the_block_has_all_kernel_threads_too(three_threads):
