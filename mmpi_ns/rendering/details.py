@@ -3,7 +3,9 @@
 A field is smooth where rays are few, and colours that change with the viewing direction faster than its network are
 averaged. The difference of each training image from its rendering is kept with the rendered depths. An image from
 another place adds the differences of the nearest training images, each where it shows the same surface, the more the
-nearer its viewing direction is. Source: weights as in unstructured lumigraph rendering (Buehler et al. 2001), applied
+nearer its viewing direction is. A field fits its training images more closely than others: what it has learned of one
+image alone is no difference there, but lacks elsewhere, so a part of each difference is from the rendering to which it
+is added. Source: weights as in unstructured lumigraph rendering (Buehler et al. 2001), applied
 to differences instead of colours, so that what no training image shows stays the field's.
 """
 
@@ -28,7 +30,7 @@ from rich.progress import track
 from torch import Tensor
 
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH, seen_details
+from mmpi_ns.ops.details import HERE, LEAST_WEIGHT, MIDDLE, STRENGTH, seen_details
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.arrays import write_arrays
 from mmpi_ns.utils.errors import InputError, brief
@@ -54,8 +56,8 @@ class DetailView:
     """A training image, as ``ops.details.seen_details`` needs it."""
 
     image: Float[Tensor, "H W 4"]
-    """Difference of the radiance (image minus rendering: red, green, blue), and inverse distance along the ray; -1
-    where the image is masked."""
+    """Difference of the radiance (image minus ``1 - HERE`` of its rendering, ``HERE * MIDDLE`` lower: red, green,
+    blue), and inverse distance along the ray; -1 where the image is masked."""
     camera: Float[Tensor, "24"]
 
 
@@ -95,11 +97,12 @@ class Details:
         limit = distances[-1] if len(chosen) > nearest and distances[-1] > 0 else np.inf
         chosen, shares = chosen[:nearest], (1 - (distances / limit) ** 2)[:nearest].tolist()
         views, details = [self.view(i, origins.device) for i in chosen], []
-        disparities = 1 / outputs["depth"].reshape(-1, 1)
-        for starts, ways, near in zip(*(x.split(PART) for x in (origins, directions, disparities)), strict=True):
+        disparities, radiance = 1 / outputs["depth"].reshape(-1, 1), outputs.get("radiance", outputs["rgb"])
+        rays = origins, directions, disparities, radiance.reshape(-1, 3)
+        for starts, ways, near, field in zip(*(x.split(PART) for x in rays), strict=True):
             total, weight = torch.zeros_like(starts), torch.full_like(near, LEAST_WEIGHT)
             for view, share in zip(views, shares, strict=True):  # the weighted mean of what they show
-                difference, seen = seen_details(starts, ways, near, view.image, view.camera)
+                difference, seen = seen_details(starts, ways, near, field, view.image, view.camera)
                 total += share * seen * difference
                 weight += share * seen
             details.append(STRENGTH * total / weight)
@@ -183,8 +186,9 @@ def write_details(
         outputs = outputs_of(bundle)
         factor = (factors[i] if len(factors) else torch.ones(3)).to(outputs["depth"])
         observed = torch.from_numpy(image[..., :3]).to(factor) / 255
-        shown = (factor * outputs.get("radiance", outputs["rgb"])).clamp(0, 1)
-        difference = (observed - shown) / factor * (LEVELS / LARGEST)
+        radiance = outputs.get("radiance", outputs["rgb"])
+        difference = (observed - (factor * radiance).clamp(0, 1)) / factor + HERE * (radiance - MIDDLE)
+        difference *= LEVELS / LARGEST
         masked = torch.from_numpy(usable == 0).to(factor.device)
         arrays = {
             "difference": difference.round().clamp(-LEVELS, LEVELS).to(torch.int8).cpu().numpy(),

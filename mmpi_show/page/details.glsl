@@ -30,7 +30,7 @@ vec3 codesAt(sampler2DArray images, vec2 place, vec2 size, float layer) {
 }
 
 // What to add to the radiance of a ray whose surface is at this inverse distance.
-vec3 details(vec3 direction, float inverse) {
+vec3 details(vec3 direction, float inverse, vec3 radiance) {
   vec3 total = vec3(0.0);
   float weight = LEAST_WEIGHT;
   for (int i = 0; i < SEEN; i++) {
@@ -44,7 +44,8 @@ vec3 details(vec3 direction, float inverse) {
     if (code < 0.5) continue;
     float root = max(code - 1.0, 0.0) / 254.0, angle = length(relative / far - direction);
     float w = image.w * agreement(seenEye[i].w * root * root, inverse / far, seenLens[i].x * length(towards), angle);
-    total += w * faded(angle) * seenStep * (codesAt(differences, at / image.xy, image.xy, image.z) - 128.0);
+    vec3 difference = seenStep * (codesAt(differences, at / image.xy, image.xy, image.z) - 128.0);
+    total += w * faded(angle) * (difference - HERE * (radiance - MIDDLE));
     weight += w;
   }
   return STRENGTH * total / weight;
@@ -55,5 +56,5 @@ vec3 detailed(vec3 color, vec3 direction, float surface) {
   if (seen == 0 || mass <= 0.0) return color;
   float opacity = 1.0 - light;
   if (opacity < 0.9) surface = march(direction, mass);
-  return clamp(color + exposure * opacity * details(direction, max(surface, infinity)), 0.0, 1.0);
+  return clamp(color + exposure * opacity * details(direction, max(surface, infinity), color / exposure), 0.0, 1.0);
 }

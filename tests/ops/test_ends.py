@@ -33,6 +33,6 @@ def test_weights_of_details_stand_in_one_header_too(tmp_path, monkeypatch):
     page = write_page(tmp_path).read_text(encoding="utf-8")
     numbers = dict(re.findall(r"const float (\w+) = (\S+);", details.TEXT))
     assert page.count(details.TEXT) == 1 and f"const MAX_ANGLE = {MAX_ANGLE};" in page
-    assert len(numbers) == 7 and all(getattr(details, name) == float(x) for name, x in numbers.items())
+    assert len(numbers) == 9 and all(getattr(details, name) == float(x) for name, x in numbers.items())
     shader = (PAGE / "details.glsl").read_text(encoding="utf-8")
     assert "agreement(" in shader and "faded(" in shader and not re.search(rf"\b({'|'.join(numbers)}) =", shader)

@@ -11,7 +11,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.details import FADE, SAME_DEPTH, SAME_PIXELS, TURN, project, seen_details
+from mmpi_ns.ops.details import FADE, HERE, MIDDLE, SAME_DEPTH, SAME_PIXELS, TURN, project, seen_details
 
 LENS = [0.08, -0.02, 0.004, 0.0, 0.003, -0.002]
 HEIGHT, WIDTH = 20, 28
@@ -58,7 +58,7 @@ def bilinear(image, x, y):
     return (1 - b) * above + b * ((1 - a) * image[y0 + 1, x0] + a * image[y0 + 1, x0 + 1])
 
 
-def oracle(cameras, image, origin, direction, inverse):
+def oracle(cameras, image, origin, direction, inverse, radiance):
     """Weight and weighted difference of one ray."""
     pose = cameras.camera_to_worlds[0].double().numpy()
     relative = inverse * (origin - pose[:, 3]) + direction
@@ -89,7 +89,8 @@ def oracle(cameras, image, origin, direction, inverse):
     margin = SAME_DEPTH * max(there, here) + SAME_PIXELS / max(float(cameras.fx) * baseline, 1e-9)
     turn = np.linalg.norm(relative / length - direction)
     weight = math.exp(-min(((there - here) / margin) ** 2, 80)) / (turn + TURN)
-    return weight, weight * np.array(difference) / (1 + (turn / FADE) ** 2)
+    difference = np.array(difference) - HERE * (radiance - MIDDLE)
+    return weight, weight * difference / (1 + (turn / FADE) ** 2)
 
 
 @pytest.mark.parametrize("lens", [None, LENS])
@@ -105,11 +106,12 @@ def test_details_are_those_of_single_rays(place, depth, kind, lens):
     cameras, image = camera(*place, kind=kind, lens=lens), random_image(1, depth)
     rays = image_rays(camera(kind=kind, lens=lens)).flatten()
     inverse = torch.full((len(rays), 1), 1 / depth)
-    difference, weight = seen_details(rays.origins, rays.directions, inverse, image, numbers(cameras))
+    radiance = torch.rand(len(rays), 3, generator=torch.Generator().manual_seed(2))
+    difference, weight = seen_details(rays.origins, rays.directions, inverse, radiance, image, numbers(cameras))
     assert torch.isfinite(difference).all() and torch.isfinite(weight).all()
     expected = [
-        oracle(cameras, image, o, d, 1 / depth)
-        for o, d in zip(rays.origins.double().numpy(), rays.directions.double().numpy(), strict=True)
+        oracle(cameras, image, o, d, 1 / depth, field)
+        for o, d, field in zip(*(x.double().numpy() for x in (rays.origins, rays.directions, radiance)), strict=True)
     ]
     weights, products = np.array([w for w, _ in expected]), np.stack([product for _, product in expected])
     # In one arithmetic a pixel may lie in the image, or between masked ones, and just outside in the other.
@@ -134,7 +136,7 @@ def test_directions_that_a_lens_folds_back_are_outside():
     cameras = camera(lens=[-0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
     wide, image = torch.tensor([[1.8, 0.0, -1.0]]), torch.ones(HEIGHT, WIDTH, 4)
     assert 0 < 22 * 1.8 * (1 - 0.3 * 1.8**2) + 14.5 < WIDTH, "the test's direction does not fold"
-    ray = torch.zeros(1, 3), torch.nn.functional.normalize(wide), torch.ones(1, 1), image
+    ray = torch.zeros(1, 3), torch.nn.functional.normalize(wide), torch.ones(1, 1), torch.zeros(1, 3), image
     assert float(seen_details(*ray, numbers(cameras, reach=10.0)).weight) > 1
     assert float(seen_details(*ray, numbers(cameras, reach=0.9)).weight) == 0
 
@@ -142,6 +144,7 @@ def test_directions_that_a_lens_folds_back_are_outside():
 def test_an_image_of_one_pixel_and_no_rays():
     cameras, one = numbers(camera()), torch.tensor([[[0.1, 0.2, 0.3, 0.25]]])
     ray = torch.zeros(1, 3), torch.nn.functional.normalize(torch.tensor([[-0.64, 0.4, -1.0]])), torch.full((1, 1), 0.25)
+    ray = *ray, torch.full((1, 3), MIDDLE)
     assert torch.allclose(seen_details(*ray, one, cameras).difference, one[0, :, :3])
-    nothing = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 1)
+    nothing = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 1), torch.zeros(0, 3)
     assert seen_details(*nothing, one, cameras).weight.shape == (0, 1)

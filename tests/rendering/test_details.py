@@ -15,7 +15,7 @@ from nerfstudio.cameras.rays import RayBundle
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
-from mmpi_ns.ops.details import LEAST_WEIGHT, STRENGTH
+from mmpi_ns.ops.details import HERE, LEAST_WEIGHT, MIDDLE, STRENGTH
 from mmpi_ns.rendering.details import (
     LARGEST,
     LEVELS,
@@ -57,13 +57,20 @@ def test_details_are_the_weighted_mean_of_the_views():
     shares = [1 - (distance / 2) ** 2 for distance in (0.5, 1.0)]
     angles = [2 * math.sin(math.atan(x / 5) / 2) for x in (0.5, 1.0)]
     weights = [share / (angle + 0.01) for angle, share in zip(angles, shares, strict=True)]
-    faded = [value / (1 + (angle / 0.2) ** 2) for angle, value in zip(angles, (0.2, -0.1), strict=True)]
+    faded = [
+        (value - HERE * (0.3 - MIDDLE)) / (1 + (angle / 0.2) ** 2)
+        for angle, value in zip(angles, (0.2, -0.1), strict=True)
+    ]
     expected = STRENGTH * (faded[0] * weights[0] + faded[1] * weights[1]) / (sum(weights) + LEAST_WEIGHT)
-    outputs = {"depth": torch.full((1, 1, 1), 5.0), "accumulation": torch.ones(1, 1, 1), "rgb": torch.zeros(1, 1, 3)}
+    outputs = {
+        "depth": torch.full((1, 1, 1), 5.0),
+        "accumulation": torch.ones(1, 1, 1),
+        "rgb": torch.full((1, 1, 3), 0.3),
+    }
     shown = Details(torch.stack(cameras), lambda i, _: views[i]).added(
         outputs | {"radiance": outputs["rgb"]}, ray, 2, None
     )
-    assert torch.allclose(shown["radiance"], torch.full((1, 1, 3), expected), rtol=1e-3)
+    assert torch.allclose(shown["radiance"], torch.full((1, 1, 3), 0.3 + expected), rtol=1e-3)
 
 
 def write(folder, cameras, planes, mask=None, step=7, factors=()):
@@ -96,11 +103,12 @@ def test_what_is_written_is_read(tmp_path):
     assert "Details of 3 training images" in write(tmp_path, cameras, planes, factors=[[0.8, 1.0, 1.2]] * 3)
     details = read_details(tmp_path)
     for i, expected in enumerate(planes):
+        field = 128 / 255 / torch.tensor([0.8, 1.0, 1.2])[:, None, None] - expected[:3]
         view = details.view(i, torch.device("cpu"))
         assert torch.allclose(view.camera[:12].view(3, 4), cameras.camera_to_worlds[i])
         assert view.camera[12:16].tolist() == [22.0, 21.0, 14.5, 9.0]
         difference, inverse = view.image[..., :3].movedim(-1, 0), view.image[..., 3]
-        assert (difference - expected[:3]).abs().max() <= 0.5 * LARGEST / LEVELS + 1e-4
+        assert (difference - expected[:3] - HERE * (field - MIDDLE)).abs().max() <= 0.5 * LARGEST / LEVELS + 1e-4
         assert torch.allclose(inverse, expected[3], rtol=1e-3)
 
 
@@ -114,17 +122,19 @@ def read_details(folder):
 def test_an_image_at_a_training_camera_gets_its_details(tmp_path):
     planes = [random_planes(0, 4.0)]
     write(tmp_path, joined(camera()), planes)
-    bundle = image_rays(camera())
+    bundle, field = image_rays(camera()), 128 / 255 - planes[0][:3].movedim(0, -1)
     outputs = {"depth": 1 / planes[0][3][..., None], "accumulation": torch.ones(HEIGHT, WIDTH, 1),
-               "rgb": torch.full((HEIGHT, WIDTH, 3), 0.5)}  # fmt: skip
+               "rgb": field}  # fmt: skip
     shown = read_details(tmp_path).added(outputs, bundle, 4, None)
     expected = STRENGTH * planes[0][:3].movedim(0, -1)
-    assert torch.allclose(shown["rgb"], (0.5 + expected).clamp(0, 1), atol=4e-3)
-    assert bool((shown["field_rgb"] == 0.5).all())
+    assert torch.allclose(shown["rgb"], (field + expected).clamp(0, 1), atol=4e-3)
+    assert torch.equal(shown["field_rgb"], field)
     double = read_details(tmp_path).added(outputs, bundle, 4, torch.full((3,), 2.0))
-    assert torch.allclose(double["rgb"], (0.5 + 2 * expected).clamp(0, 1), atol=8e-3)
+    assert torch.allclose(double["rgb"], (field + 2 * expected).clamp(0, 1), atol=8e-3)
     light = read_details(tmp_path).added(outputs | {"radiance": outputs["rgb"]}, bundle, 4, None)
-    assert torch.allclose(light["radiance"], 0.5 + expected, atol=4e-3) and bool((light["field_radiance"] == 0.5).all())
+    assert torch.allclose(light["radiance"], field + expected, atol=4e-3) and torch.equal(
+        light["field_radiance"], field
+    )
 
 
 def test_other_surfaces_masks_and_empty_pixels_show_nothing(tmp_path):
@@ -155,8 +165,8 @@ def test_details_change_smoothly_as_a_camera_moves(tmp_path):
     details, shown = read_details(tmp_path), []
     for x in np.linspace(0.2, 0.8, 241):
         bundle = image_rays(camera(float(x)))
-        nothing, whole = torch.zeros(HEIGHT, WIDTH, 3), torch.ones(HEIGHT, WIDTH, 1)
-        outputs = {"rgb": nothing, "radiance": nothing, "depth": 4 * whole, "accumulation": whole}
+        grey, whole = torch.full((HEIGHT, WIDTH, 3), MIDDLE), torch.ones(HEIGHT, WIDTH, 1)
+        outputs = {"rgb": grey, "radiance": grey, "depth": 4 * whole, "accumulation": whole}
         shown.append(details.added(outputs, bundle, 2, None)["radiance"][8:12, 12:16].mean())
     steps = torch.stack(shown).diff().abs()
     assert torch.stack(shown).std() > 0.05

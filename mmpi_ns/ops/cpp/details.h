@@ -5,6 +5,8 @@ const float FADE = 0.2;         // angle at which half of a difference is left, 
 const float SAME_DEPTH = 0.05;  // relative difference of inverse depths within which two images show one surface
 const float SAME_PIXELS = 0.5;  // ... or displacement by their difference, pixels
 const float STRENGTH = 1.2;     // a field fits its training images better than others, which lack more
+const float HERE = 0.2;         // share of a difference that is from the image being rendered, not from its own rendering
+const float MIDDLE = 0.5;       // radiance from which both are counted, so that stored differences stay small
 const float LEAST_WEIGHT = 0.1; // total weight of training images below which details fade
 const float TINY = 1e-9;
 

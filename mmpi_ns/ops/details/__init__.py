@@ -15,8 +15,8 @@ from mmpi_ns.ops.ends import numbers_in
 
 TEXT = (HEADERS / "details.h").read_text(encoding="utf-8")
 """Lines that both C++ and GLSL understand: the numbers below with what they mean, and the weights."""
-TURN, FADE, SAME_DEPTH, SAME_PIXELS, STRENGTH, LEAST_WEIGHT, TINY = numbers_in(
-    TEXT, "TURN", "FADE", "SAME_DEPTH", "SAME_PIXELS", "STRENGTH", "LEAST_WEIGHT", "TINY"
+TURN, FADE, SAME_DEPTH, SAME_PIXELS, STRENGTH, HERE, MIDDLE, LEAST_WEIGHT, TINY = numbers_in(
+    TEXT, "TURN", "FADE", "SAME_DEPTH", "SAME_PIXELS", "STRENGTH", "HERE", "MIDDLE", "LEAST_WEIGHT", "TINY"
 )
 
 
@@ -59,17 +59,20 @@ def seen_details(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
     inverse: Float[Tensor, "R 1"],
+    radiance: Float[Tensor, "R 3"],
     image: Float[Tensor, "H W 4"],
     camera: Float[Tensor, "24"],
 ) -> SeenDetails:
-    """The values of an image, interpolated, where it shows the surfaces of rays. The less the viewing direction
+    """The differences of an image, interpolated, where it shows the surfaces of rays. The less the viewing direction
     differs, the more they weigh and the less they fade; and the better the depths agree, the more they weigh.
 
     Args:
         origins: of the rays.
         directions: of the rays, unit length.
         inverse: 1 / distance of their surfaces along the rays; 0 is infinity.
-        image: three values, and inverse distances along the image's own rays; below 0 where it is masked.
+        radiance: of the field along the rays.
+        image: three differences (``rendering.details.DetailView``), and inverse distances along the image's own
+            rays; below 0 where it is masked.
         camera: its pose, camera to world row by row; fx, fy, cx, cy in pixels; nerfstudio's k1, k2, k3, k4, p1, p2;
             whether angles are proportional to distances from the centre (fisheye); and the largest distance of a pixel
             from the centre before the distortion, in focal lengths.
@@ -88,5 +91,5 @@ def seen_details(
     margin = SAME_DEPTH * torch.maximum(there, here) + SAME_PIXELS / shift.clamp(min=TINY)
     turn = (relative / length - directions).norm(dim=-1, keepdim=True)
     agrees = torch.exp(-((there - here) / margin).square().clamp(max=80)) / (turn + TURN)
-    faded = values[:, :3] / (1 + (turn / FADE).square())
+    faded = (values[:, :3] - HERE * (radiance - MIDDLE)) / (1 + (turn / FADE).square())
     return SeenDetails(faded, torch.where(inside[:, None] & (there >= 0), agrees, 0.0))

@@ -50,7 +50,7 @@ void look_up(const float* image, int64_t height, int64_t width, float column, fl
 
 // Rays [begin, end): the image's values at their surfaces, and weights.
 void mmpi_seen_details(int64_t begin, int64_t end, const float* origins, const float* directions, const float* inverse,
-                       const float* image, const float* numbers, int64_t, int64_t height, int64_t width,
+                       const float* radiance, const float* image, const float* numbers, int64_t, int64_t height, int64_t width,
                        float* difference, float* weight) {
     const Camera& camera = *reinterpret_cast<const Camera*>(numbers);
     for (int64_t i = begin; i < end; i++) {
@@ -68,7 +68,7 @@ void mmpi_seen_details(int64_t begin, int64_t end, const float* origins, const f
             for (int k = 0; k < 3; k++) turn[k] = relative[k] / length - direction[k];
             const float angle = norm(turn);
             if (there >= 0) weight[i] = agreement(there, here, camera.fx * norm(towards), angle);
-            for (int k = 0; k < 3; k++) values[k] *= faded(angle);
+            for (int k = 0; k < 3; k++) values[k] = (values[k] - HERE * (radiance[3 * i + k] - MIDDLE)) * faded(angle);
         }
         for (int k = 0; k < 3; k++) difference[3 * i + k] = values[k];
     }
