@@ -23,6 +23,9 @@ WORKERS ?= 2
 # Extra arguments for pytest or the demo: make test ARGS="-k geometry -x", make demo ARGS=--fresh
 ARGS ?=
 
+# Folder with the captures of `make results`, by their names there.
+DATA ?= captures
+
 .PHONY: help venv demo test lint docs build wheel figures gallery matrix results clean
 
 help: ## List these commands
@@ -76,10 +79,10 @@ matrix: venv ## Run ordinary captures of 2 to 400 images through the commands (h
 gallery: venv ## Train four procedural scenes and write docs/gallery.md with their pictures
 	$(BIN)/python examples/gallery.py $(ARGS)
 
-results: venv ## Make the tables of docs/results that take minutes again, and say how old the others are
+results: venv ## Make every number of README.md and docs/results (hours; what is finished is kept): DATA=captures/
 	$(BIN)/python benchmarks/accuracy.py
 	PYTHONPATH=tests:benchmarks $(BIN)/python tests/stability/table.py
-	$(BIN)/python benchmarks/ages.py
+	$(BIN)/python benchmarks/results.py --data $(DATA) $(ARGS)
 
 clean: ## Remove build products and caches (not .venv)
 	rm -rf build dist *.egg-info .pytest_cache .hypothesis .ruff_cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import statistics
 import subprocess
@@ -45,17 +46,32 @@ def median_s(work: Callable[[], Any], repeats: int) -> float:
     return statistics.median(times)
 
 
-def run_command(words: list[str], log: Path, threads: int, **how: Any) -> None:
+@dataclass(frozen=True)
+class Used:
+    """What a command took."""
+
+    seconds: float
+    """By the clock."""
+    processor_seconds: float
+    gib: float
+    """Most memory of its process."""
+
+
+def run_command(words: list[str], log: Path, threads: int) -> Used:
     """Runs a command to its end; what it prints goes to a log.
 
     Raises:
         ValueError: it failed; names the log.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
     with log.open("w", encoding="utf-8") as stream:
-        ended = subprocess.run(words, stdout=stream, stderr=subprocess.STDOUT, env=environment_of(threads), **how)
-    if ended.returncode:
-        raise ValueError(f"{Path(words[0]).name} failed with status {ended.returncode}: see {log}.")
+        process = subprocess.Popen(words, stdout=stream, stderr=subprocess.STDOUT, env=environment_of(threads))
+        _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise ValueError(f"{Path(words[0]).name} failed with status {process.returncode}: see {log}.")
+    return Used(time.perf_counter() - start, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 2**20)
 
 
 def train_and_evaluate(
@@ -64,18 +80,17 @@ def train_and_evaluate(
     """``ns-train`` with some options, and ``ns-eval`` with what is asked, as a user types them; logs are in the folder.
 
     Returns:
-        The run's folder, the results of ns-eval, and for the row: seconds of training, threads, machine and commit.
+        The run's folder, the results of ns-eval, and for the row: what training took, threads, machine and commit.
     """
     train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
     place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
     size = ["--data", str(scene.data), "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
-    start = time.perf_counter()
-    run_command([train, method, *place, *options, *size], folder / "train.log", threads)
-    seconds = time.perf_counter() - start
+    used = run_command([train, method, *place, *options, *size], folder / "train.log", threads)
     run, found = folder / "run" / method / "1", folder / "eval.json"
     words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(found), *asked]
     run_command(words, folder / "eval.log", threads)
-    made = {"train_seconds": seconds, "threads": threads, "processor": processor(), "commit": commit()}
+    made = {"train_seconds": used.seconds, "processor_seconds": used.processor_seconds, "gib": used.gib}
+    made |= {"threads": threads, "processor": processor(), "commit": commit()}
     return run, read_json(found)["results"], made | {"date": date.today().isoformat()}
 
 

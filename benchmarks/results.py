@@ -1,137 +1,220 @@
-"""Trains and evaluates the variants of a suite with the real commands, as a user types them."""
+"""Makes every number of README.md and docs/results/README.md with the real commands, as a user types them.
+
+    make results DATA=captures/          # captures by their names below; what is finished is kept, so it resumes
+
+Captures that the folder lacks are left out, and the pages name them.
+"""
 
 from __future__ import annotations
 
-import functools
-import json
+import re
+import statistics
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from lab import SceneBench, figure, train_and_evaluate
-from methods import Method
-from report import Report, Row, page, slug, table
-from suites import DEFAULT, SUITES
+from lab import figure, train_and_evaluate
+from report import Bench, Report, Row, read_json, slug, stamp_line, table
 
-from mmpi_ns.placement.errors import PixelErrors, pixel_errors
-from mmpi_ns.placement.observations import find_visible_points
-from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.scripts.command import run
-from mmpi_ns.scripts.plan import load_observations
 
-RAYS_PER_STEP = 1024
+ROOT = Path(__file__).resolve().parents[1]
+LPIPS = ("--pipeline.model.lpips-net", "none")
+"""Its weights cannot be had everywhere."""
+PAPER = ("--max-num-iterations", "2500", "--pipeline.datamanager.train-num-rays-per-batch", "1024")
+"""The paper's 40,000 steps scaled to a sixteenth of the pixels: as many epochs, of 1,024 rays a step."""
+JOINT = ("--pipeline.model.schedule.training", "joint")
+FACES = "--pipeline.model.placement.faces"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One training of a capture."""
+
+    capture: str
+    factor: int
+    method: str = "mmpi"
+    options: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = (0,)
+    name: str = "defaults"
+    group: str = "captures"
+
+    @property
+    def key(self) -> str:
+        return f"{self.capture} /{self.factor}, {self.method}, {self.name}"
+
+
+STREET = ("kitti-street", 4)
+VARIANTS = (
+    Variant(*STREET, seeds=(0, 1, 2)),
+    Variant("kitti-street", 1),
+    Variant("kitchen", 2),
+    Variant("fox", 2),
+    Variant("room-walk", 2),
+    Variant("phone-walk", 2),
+    *(
+        Variant(*STREET, options=("--max-num-iterations", str(n)), name=f"{n:,} steps", group="length")
+        for n in (300, 600, 1250, 10_000)
+    ),
+    *(
+        Variant(*STREET, "mmpi-kitti", (*PAPER, *options), name=name, group="paper")
+        for name, options in (
+            ("one MPI (front), joint", (FACES, "front", *JOINT)),
+            ("four MPIs, joint", JOINT),
+            ("four MPIs, each alone, then reliability", ()),
+        )
+    ),
+)
 
 
 @dataclass
-class Results(SceneBench):
-    """Trains and evaluates every variant of a suite on a scene, as a user would.
+class Results(Bench):
+    """Trains and evaluates all variants; finished ones are kept. Fills the tables of README.md and of
+    docs/results/README.md."""
 
-    Rows that are finished are kept in SUITE.json.
-    """
-
-    suite: str
-    """Which variants: kitti-street, room-walk, fern, fox; kitti-street-budgets and room-walk-budgets draw quality over
-    texels."""
+    data: Path = Path("captures")
+    """Folder with the captures."""
     only: str = ""
-    """Run only variants whose group and name contain this."""
+    """Run only variants whose key or group contains this."""
 
     name = "results"
 
     def run(self) -> None:
-        if self.suite not in SUITES:
-            raise ValueError(f"There is no suite {self.suite!r}: choose from {', '.join(SUITES)}.")
-        report = Report(self, file=self.suite)
-        for variant in SUITES[self.suite]:
-            if self.only in variant.key:
-                row = report.row(variant.key, lambda variant=variant: self._row(variant))
-                print(json.dumps({variant.key: row}), flush=True)
-        draw = (lambda path: draw_budgets(path, report.rows)) if self.suite.endswith("-budgets") else None
-        head = {f"{slug(name)}_{what}": r[what] for name, r in report.rows.items() for what in ("psnr", "ssim")}
-        report.finish(head, markdown(self.suite, report.content), draw)
+        report = Report(self, self.key("only", "data"))
+        for variant in VARIANTS:
+            if self.only in f"{variant.group}: {variant.key}":
+                for seed in variant.seeds:
+                    report.row(f"{variant.key}, seed {seed}", lambda v=variant, s=seed: self._row(v, s), needed=False)
+        report.content["headline"] = {f"{slug(key)}_psnr": r["psnr"] for key, r in finished(report.content).items()}
+        report.save()
+        scored = read_json(self.output / "score.json")
+        draw(self.output / "results.png", report.content, scored)
+        fill(self.output / "README.md", {"results": results_page(report.content, scored)})
+        fill(ROOT / "README.md", {"results": readme_table(report.content, scored)})
 
-    def _row(self, variant: Method) -> Row:
-        folder = self.folder / self.suite / slug(variant.key, "-")
-        steps = [] if not variant.steps else ["--max-num-iterations", str(variant.steps)]
-        options, renders = [*steps, *variant.options], ["--render-output-path", str(folder / "renders")]
-        run, results, made = train_and_evaluate(self.scene, folder, variant.registered, options, renders, self.cores)
-        row = {k: results[k] for k in ("psnr", "ssim", "num_rays_per_sec", "dropped_mass") if k in results}
-        row |= {k: v for k, v in results.items() if k.startswith("lpips") and not k.endswith("std")}
-        # MPIs, texels and expected pixel errors of the plan that the run used.
-        plan, observations = (
-            WindowedPlan.load(run / "plan.json").plans[0],
-            _observations(self.data, self.downscale_factor),
-        )
-        visible = find_visible_points(observations)
-        row |= {"mpis": len(plan.mpis), "texels": plan.texels}
-        row |= error_figures(pixel_errors(plan, observations, visible.cameras, visible.points))
-        return row | made | {"steps": steps_of(run), "command": " ".join(["ns-train", variant.registered, *options])}
+    def _row(self, variant: Variant, seed: int) -> Row:
+        if not (self.data / variant.capture / "transforms.json").is_file():
+            return {"not_run": "the capture is not there"}
+        folder = self.folder / slug(f"{variant.key} {seed}", "-")
+        options = [*LPIPS, "--machine.seed", str(seed), *variant.options]
+        renders = ["--render-output-path", str(folder / "renders")]
+        scene = Scene(self.data / variant.capture, variant.factor)
+        _, results, made = train_and_evaluate(scene, folder, variant.method, options, renders, self.cores)
+        row = {k: results[k] for k in ("psnr", "ssim", "field_psnr", "field_ssim", "num_rays_per_sec") if k in results}
+        row |= {"key": variant.key, "group": variant.group, "capture": f"{variant.capture} /{variant.factor}"}
+        row |= {"name": f"`{variant.method}`" + (f", {variant.name}" if variant.name != "defaults" else "")}
+        print(f"{variant.key}, seed {seed}: {row['psnr']:.2f} dB, {row['ssim']:.3f}", flush=True)
+        return row | made | {"command": " ".join(["ns-train", variant.method, *options])}
 
 
-def error_figures(errors: PixelErrors) -> dict[str, float]:
-    """Medians and 90th percentiles over the observations, each in its best head; fraction outside all heads."""
-    served, heads = np.isfinite(errors.combined.min(-1)), errors.combined.argmin(-1)
-    figures = {"unserved": float(1 - served.mean()) if len(served) else 0.0}
-    for name, values in (("e_p", errors.plane), ("e_t", errors.texel)):
-        best = np.take_along_axis(values, heads[:, None], -1)[served, 0]
-        for q in (50, 90):
-            figures[f"{name}_{q}"] = float(np.percentile(best, q)) if len(best) else float("nan")
-    return figures
+# Tables --------------------------------------------------------------------------------------------------------------
 
 
-def markdown(suite: str, content: Row) -> str:
-    """The page."""
+def finished(content: Row) -> dict[str, Row]:
+    return {key: row for key, row in content["rows"].items() if "not_run" not in row}
+
+
+def means(content: Row, *groups: str) -> list[Row]:
+    """Rows of some groups, several seeds as their means with standard deviations."""
+    rows: dict[str, list[Row]] = {}
+    for row in finished(content).values():
+        if row["group"] in groups:
+            rows.setdefault(row["key"], []).append(row)
+    merged = []
+    for same in rows.values():
+        row = dict(same[0])
+        for name in ("psnr", "ssim", "field_psnr", "field_ssim", "train_seconds", "processor_seconds", "gib"):
+            values = [r[name] for r in same if name in r]
+            row[name] = statistics.fmean(values) if values else None
+        row["spread"] = f" ± {statistics.stdev(r['psnr'] for r in same):.2f}" if len(same) > 1 else ""
+        merged.append(row)
+    return merged
+
+
+def peers(scored: Row, capture: str) -> list[Row]:
+    """Rows of other programs whose training took a known time."""
+    return [r for r in scored.get("rows", {}).values() if r["scene"] == capture and r["seconds"]]
+
+
+def readme_table(content: Row, scored: Row) -> str:
+    """The captures of README.md, with the best of other programs on the same test images."""
+    lines = []
+    for row in means(content, "captures"):
+        others = peers(scored, row["capture"]) + peers(scored, row["capture"].replace(" ", "-undistorted "))
+        best = max(others, key=lambda r: r["psnr"], default=None)
+        other = f"{best['psnr']:.2f} / {best['ssim']:.3f} ({best['seconds']:.0f} s)" if best else ""
+        lines.append(row | {"other": other})
     columns = {
-        "variant": "{name}",
-        "PSNR": "{psnr:.2f}",
-        "SSIM": "{ssim:.3f}",
-        "LPIPS": lambda r: next((f"{v:.3f}" for k, v in r.items() if k.startswith("lpips")), "no weights"),
-        "rays": lambda r: f"{r['steps'] * RAYS_PER_STEP / 1e6:.2f} M",
-        "training, s": "{train_seconds:.0f}",
-        "threads": "{threads}",
-        "render rays/s": "{num_rays_per_sec:.0f}",
-        "MPIs": "{mpis}",
-        "M texels": lambda r: f"{r['texels'] / 1e6:.1f}",
-        "e_p": "{e_p_50:.2f} / {e_p_90:.2f}",
-        "e_t": "{e_t_50:.2f} / {e_t_90:.2f}",
+        "capture": "{capture}",
+        "PSNR / SSIM": "{psnr:.2f} / {ssim:.3f}",
+        "field alone": "{field_psnr:.2f} / {field_ssim:.3f}",
+        "processor time, memory": lambda r: f"{r['processor_seconds'] / 60:.0f} min, {r['gib']:.1f} GiB",
+        "3D Gaussian splatting on a CPU": "{other}",
     }
-    rows, blocks = content["rows"], []
-    for group in dict.fromkeys(v.group for v in SUITES[suite]):
-        own = ({"name": v.name, **rows[v.key]} for v in SUITES[suite] if v.group == group and v.key in rows)
-        blocks += [f"## {group}" if group else "", table(columns, own)]
-    commits = sorted({f"{r['commit']} ({r['date']})" for r in rows.values()})
-    said = f"""\
-Rows ran on {" and ".join(sorted({r["processor"] for r in rows.values()}))}. Every figure is `ns-eval`'s mean over all
-test images. Rays are pixel rays of training; e_p and e_t are the expected pixel errors for lack of planes and of
-texels (median / 90th percentile over the training observations, each in the MPI that serves it best)."""
-    last = f"Commits: {', '.join(commits)}. Options of each row: `{suite}.json`."
-    return page(suite, content["made"], said, blocks, last)
+    return table(columns, lines)
 
 
-def draw_budgets(path: Path, rows: dict[str, Row]) -> None:
-    """PSNR and SSIM over millions of texels, the default apart."""
-    held = sorted((r for name, r in rows.items() if name != DEFAULT), key=lambda r: r["texels"])
-    texels = [r["texels"] / 1e6 for r in held]
-    ticks = [m for m in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if 0.7 * min(texels) <= m <= 1.4 * max(texels)]
-    with figure(path, 1, 2, (9, 3.2)) as (axes,):
+def results_page(content: Row, scored: Row) -> str:
+    """All tables of docs/results/README.md."""
+    columns = {
+        "capture": "{capture}",
+        "method": "{name}",
+        "PSNR": "{psnr:.2f}{spread}",
+        "SSIM": "{ssim:.3f}",
+        "field alone": lambda r: f"{r['field_psnr']:.2f} / {r['field_ssim']:.3f}" if r["field_psnr"] else "the same",
+        "seconds": "{train_seconds:.0f}",
+        "processor s": "{processor_seconds:.0f}",
+        "GiB": "{gib:.1f}",
+        "rendering, rays/s": "{num_rays_per_sec:.0f}",
+    }
+    missing = [key for key, row in content["rows"].items() if "not_run" in row]
+    blocks = [stamp_line(content["made"])]
+    for title, group in (("Defaults", "captures"), ("Longer and shorter", "length"), ("The paper's methods", "paper")):
+        blocks += [f"**{title}**", table(columns, means(content, group))]
+    blocks += ["![PSNR and SSIM over seconds](results.png)"]
+    if missing:
+        blocks += [f"Not run: {'; '.join(missing)}."]
+    return "\n\n".join(blocks)
+
+
+def fill(page: Path, parts: dict[str, str]) -> None:
+    """Replaces what stands between ``<!-- name -->`` and ``<!-- /name -->``.
+
+    Raises:
+        ValueError: the page has no such place.
+    """
+    text = page.read_text(encoding="utf-8")
+    for name, part in parts.items():
+        place = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+        if not place.search(text):
+            raise ValueError(f"{page} has no place for {name}.")
+        text = place.sub(lambda found, part=part: f"{found[1]}\n{part}\n\n{found[2]}", text)
+    page.write_text(text, encoding="utf-8")
+
+
+def draw(path: Path, content: Row, scored: Row) -> None:
+    """PSNR and SSIM over seconds of training on one capture: ours by length, and other programs."""
+    capture = f"{STREET[0]} /{STREET[1]}"
+    ours = [r for r in means(content, "captures", "length", "paper") if r["capture"] == capture]
+    lengths = sorted((r for r in ours if r["group"] != "paper"), key=lambda r: r["processor_seconds"])
+    if not lengths:
+        return
+    kinds: Iterable[tuple[str, list[Row], str, str]] = (
+        ("mmpi, 300 to 10,000 steps", lengths, "o-", "processor_seconds"),
+        ("mmpi-kitti (paper)", [r for r in ours if r["group"] == "paper"], "s", "processor_seconds"),
+        ("OpenSplat", peers(scored, capture), "^", "seconds"),
+    )
+    with figure(path, 1, 2, (9, 3.4)) as (axes,):
         for axis, what, label in zip(axes, ("psnr", "ssim"), ("PSNR, dB", "SSIM"), strict=True):
-            axis.plot(texels, [r[what] for r in held], "o-", color="0.4", label="held to a budget")
-            if DEFAULT in rows:
-                row = rows[DEFAULT]
-                axis.plot(row["texels"] / 1e6, row[what], "*", markersize=13, color="tab:red", label=DEFAULT)
-            axis.set(xscale="log", xlabel="million texels", ylabel=label)
-            axis.set_xticks(ticks, [f"{m:g}" for m in ticks])
-            axis.minorticks_off()
-
-
-@functools.cache
-def _observations(data: Path, downscale_factor: int):
-    return load_observations(data, downscale_factor)[0]
-
-
-def steps_of(run: Path) -> int:
-    """Steps of a finished run, by its last checkpoint."""
-    return 1 + max(int(p.stem.split("-")[1]) for p in (run / "nerfstudio_models").glob("step-*.ckpt"))
+            for name, rows, style, seconds in kinds:
+                axis.plot([r[seconds] for r in rows], [r[what] for r in rows], style, label=name)
+            field = f"field_{what}"
+            axis.plot(
+                [r["processor_seconds"] for r in lengths], [r[field] for r in lengths], "o--", label="field alone"
+            )
+            axis.set(xscale="log", xlabel="processor seconds of training", ylabel=label, title=capture)
 
 
 if __name__ == "__main__":

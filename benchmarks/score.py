@@ -60,8 +60,7 @@ def markdown(content: Row) -> str:
         "remark": "{remark}",
     }
     rows = list(content["rows"].values())
-    commands = ["Rows were made by:", "\n".join(f"    {r['command']}" for r in rows)]
-    return page("Images rendered by other programs", content["made"], PROTOCOL, table(columns, rows), commands)
+    return page("Images rendered by other programs", content["made"], PROTOCOL, table(columns, rows))
 
 
 if __name__ == "__main__":
