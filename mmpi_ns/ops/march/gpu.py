@@ -194,9 +194,9 @@ def show_kernel(
         slot, has = start + s, s < count
         weight, depth = _weigh(taus, befores, slot, has, depth)
         passed += weight
-        here = waits & has & (passed >= HALF * mass)
+        here = waits & has & (passed >= mass * HALF)
         median = tl.where(here, tl.load(inverse_ts + slot, has, 0.0), median)
-        waits = waits & (passed < HALF * mass)
+        waits = waits & (passed < mass * HALF)
     tl.store(medians + ray, median, inside)
 
 

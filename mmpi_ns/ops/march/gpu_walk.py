@@ -53,6 +53,7 @@ ENDLESS, REACHED = tl.constexpr(1e30), tl.constexpr(1e9)
 NEGLIGIBLE = tl.constexpr(ends.NEGLIGIBLE)
 NEAREST_ZERO = tl.constexpr(ends.NEAREST_ZERO)
 ULPS = tl.constexpr(16 * 2.0**-23)
+BORDER = tl.constexpr(1 + 16 * 2.0**-23)
 """Slack of the border test, as in ``geometry.local_to_ndc``. Triton 3.8's interpreter divides no constant by
 an array."""
 
@@ -280,7 +281,7 @@ def in_mpi(constants, k, x, y, z, dx, dy, dz, inverse_t):
     u, v = (ox * inverse_t + lx) / depth - tl.load(mpi + U0), (oy * inverse_t + ly) / depth - tl.load(mpi + V0)
     u, v = u * tl.load(mpi + U_SCALE) - 1, v * tl.load(mpi + V_SCALE) - 1
     s = 1 - tl.load(mpi + S_SCALE) * (inverse_t / depth - tl.load(mpi + END))
-    inside = (tl.abs(u) <= 1 + ULPS) & (tl.abs(v) <= 1 + ULPS) & (tl.abs(s) <= 1 / tl.load(mpi + SHARE) * ULPS + 1)
+    inside = (tl.abs(u) <= BORDER) & (tl.abs(v) <= BORDER) & (tl.abs(s) <= 1 / tl.load(mpi + SHARE) * ULPS + 1)
     return tl.where(ahead, u, 0.0), tl.where(ahead, v, 0.0), tl.where(ahead, s, 0.0), ahead & inside
 
 
