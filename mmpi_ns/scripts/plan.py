@@ -15,6 +15,7 @@ from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_f
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.errors import InputError, looked_at, quoted, say
+from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
     from mmpi_ns.data.datamanager import MMPIDataManager
@@ -42,6 +43,8 @@ class PlanCommand:
     """Format of the scene."""
     plan_file: Path | None = None
     """Evaluate this plan instead of making a new one."""
+    size: float = 1.0
+    """Multiple of texels and steps, as ``--pipeline.model.size`` of ns-train."""
     placement: PlacementConfig = field(default_factory=lambda: PLACEMENT)
     """The rule's settings."""
 
@@ -51,6 +54,7 @@ class PlanCommand:
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import make_writable
 
+        check_options(self, {"size": Number(0, above=True)}, "--")
         check_placement(self.placement, "--placement.")
         if not self.scene.exists():
             raise InputError(f"There is no scene at {looked_at(self.scene)}: check the path.")
@@ -65,8 +69,9 @@ class PlanCommand:
             )
         observations, manager = load_observations(self.scene, self.downscale_factor, self.parser)
         if windows is None:
-            steps = steps_for(most_pixels(observations, self.placement))
-            windows = place_windows(observations, self.placement, steps * RAYS)
+            steps = steps_for(most_pixels(observations, self.placement), self.size)
+            sized = replace(self.placement, max_texels=self.size * self.placement.max_texels)
+            windows = place_windows(observations, sized, steps * RAYS)
         text = self._explain(windows, observations)
         if manager.priors is not None and manager.priors.movers:
             text += f"\n\n{manager.priors.movers}."
