@@ -137,6 +137,16 @@ def test_an_image_at_a_training_camera_gets_its_details(tmp_path):
     )
 
 
+def test_what_was_learned_of_one_image_alone_is_not_lost_in_others(tmp_path):
+    """A field that fits its training image leaves no difference there; where it lacks in another, a part comes back."""
+    planes = [torch.cat([torch.zeros(3, HEIGHT, WIDTH), torch.full((1, HEIGHT, WIDTH), 0.25)])]
+    write(tmp_path, joined(camera()), planes)
+    whole = torch.ones(HEIGHT, WIDTH, 1)
+    outputs = {"depth": 4 * whole, "accumulation": whole, "rgb": 0.3 * whole.expand(-1, -1, 3)}
+    added = read_details(tmp_path).added(outputs, image_rays(camera()), 4, None)["rgb"] - 0.3
+    assert torch.allclose(added, torch.tensor(STRENGTH * HERE * (128 / 255 - 0.3)), atol=4e-3)
+
+
 def test_other_surfaces_masks_and_empty_pixels_show_nothing(tmp_path):
     def added(outputs, rays):
         return read_details(tmp_path).added(outputs, rays, 4, None)["rgb"]
