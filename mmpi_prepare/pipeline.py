@@ -70,6 +70,8 @@ class Preparation:
         source = [s.matching, s.overlap, poses]
         folder, self.matching = self._stage("matches", source, partial(self._match, folder / features.DATABASE))
         say(f"Matching: {self.matching}.")
+        names = [p.name for p in self.photos]
+        self.is_ordered = self.is_video or features.are_in_order(folder / features.DATABASE, names)
         source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
         folder, self.mapped = self._stage("model", source, partial(self._map, folder / features.DATABASE))
         model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
@@ -115,8 +117,7 @@ class Preparation:
         return folder, state["result"]
 
     def _read(self) -> None:
-        """Images, masks and known poses, whether the images come in the order of the motion, and their cameras with
-        whether intrinsics are to be kept."""
+        """Images, masks and known poses, and their cameras with whether intrinsics are to be kept."""
         s = self.settings
         self.is_video = s.input.is_file()
         if self.is_video and s.input.suffix.lower() not in images.VIDEOS:
@@ -129,7 +130,6 @@ class Preparation:
             read = partial(select_frames, s.input, max_frames=s.max_frames, step=s.frame_motion)
         _, entries = self._stage("input", source, lambda folder: [asdict(photo) for photo in read(folder)])
         self.photos = [Photo(**entry) for entry in entries]
-        self.is_ordered = self.is_video or features.are_numbered([p.name for p in self.photos])
         self.masks = None
         if s.masks is not None:
             stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
@@ -290,8 +290,8 @@ class Preparation:
                     raise InputError(f"{name} cannot be read: repair or remove it.")
                 sharp[i] = sharpness(gray)  # type: ignore[arg-type]
                 advance(1)
-        findings += checks.blurred(names, sharp, self.is_ordered)
         if self.is_ordered:
+            findings += checks.blurred(names, sharp)
             order, poses = camera_poses(model)
             offered = [p.name for p in self.photos]
             findings += checks.misplaced(order, [offered.index(n) for n in order], poses)
@@ -303,7 +303,7 @@ class Preparation:
         moves, doubt = write_masks(model, photos, split.train, self.image_folder, target, picture, s.threads)
         findings += [checks.Finding("moving?", "", doubt)] if doubt else []
         if not moves:
-            return findings, None, "nothing is seen to move"
+            return findings, None, "not known" if doubt else "nothing is seen to move"
         moving, fate = sum(moves.values()) / len(split.train), "are masked" if s.moving == "mask" else "move"
         says = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
         say(f"What moves: {says}; report/moving.jpg shows them.")
