@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -261,6 +261,13 @@ def open_focals(model: pycolmap.Reconstruction, database: Path, threads: int) ->
     fate = "kept, as the images hardly determine it" if is_open else "not kept"
     say(f"Lens: {free:.3f} px, {held:.3f} px with the focal length of EXIF ({focals} px): {fate}.")
     return noted if is_open else {}
+
+
+def keeps_focals(model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera]) -> bool:
+    """Whether all cameras of a model have kept the focal lengths that EXIF gave ``cameras``, those of the database."""
+    noted = {i: c.mean_focal_length() for i, c in enumerate(cameras, 1) if c.has_prior_focal_length}
+    used = {i: c.mean_focal_length() for i, c in model.cameras.items()}
+    return all(i in noted and np.isclose(focal, noted[i], 1e-6) for i, focal in used.items())
 
 
 def map_known_poses(

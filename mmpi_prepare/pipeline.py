@@ -23,7 +23,7 @@ from mmpi_ns.utils.errors import FULL, InputError, looked_at, progress, quoted, 
 from mmpi_ns.utils.files import whole, write_text
 from mmpi_ns.utils.values import check_options
 from mmpi_prepare import checks, export, features, images
-from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, map_known_poses
+from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_known_poses
 from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_prepare.mapping import Task, map_and_judge
 from mmpi_prepare.poses import GIVEN_COUNTS, agreeing, make_cameras, opencv_camera, read_poses
@@ -221,6 +221,9 @@ class Preparation:
     def _write(self, model: pycolmap.Reconstruction, verdict: Verdict) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
         s, says = self.settings, self.mapped["says"]
+        focal = self.mapped["focal"][1] if self.mapped["focal"] else "given"
+        if self.mapped["focal"] and keeps_focals(model, self.cameras):
+            focal = f"that of EXIF kept; by the images alone {focal}"
         up = unit = "that of the given poses"
         if self.known_poses is None or s.camera_height is not None:
             similarity, up, unit = choose_frame(model, s.camera_height)
@@ -249,7 +252,7 @@ class Preparation:
             "matching": self.matching,
             "mapping": says,
             "verdict": f"{verdict.grade} {verdict.says}".strip(),
-            "focal length": self.mapped["focal"][1] if self.mapped["focal"] else "given",
+            "focal length": focal,
             "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
             "what moves": moves,
             "up": up,
@@ -282,7 +285,8 @@ class Preparation:
     ) -> tuple[list[checks.Finding], Path | None, str]:
         """Findings on the scene to be built; the folder of its masks, given or of what moves; what moves in words."""
         s, names, sharp = self.settings, [p.name for p in photos], np.zeros(len(photos))
-        findings = checks.doubtful_intrinsics(model, self.is_fixed, self.mapped["focal"], s.threads)
+        focal = None if keeps_focals(model, self.cameras) else self.mapped["focal"]
+        findings = checks.doubtful_intrinsics(model, self.is_fixed, focal, s.threads)
         with progress("Checking images", len(names)) as advance:
             for i, name in enumerate(names):
                 gray = cv2.imread(str(self.image_folder / name), cv2.IMREAD_GRAYSCALE)
@@ -396,5 +400,5 @@ def prepare(s: Settings) -> Verdict:
             f"{s.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite (the old files are "
             "then moved aside)."
         )
-    with only_one(s.scene / WORK):
+    with only_one(s.scene / WORK), quiet():
         return Preparation(s).run()

@@ -97,3 +97,14 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile([50.0, 20], (5, 1)), np.zeros((5, 4)))
     _, masks, _ = find_moving(images, lambda i: np.zeros((0, 3)))
     assert [int(mask.sum()) for mask in masks] == ([13, 26, 13, 13, 13] if large else [0] * 5)
+
+
+def test_nothing_is_masked_where_images_are_far_apart(monkeypatch):
+    view = View(np.zeros((50, 100), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((50, 100), bool))
+    shot = Shot(view, np.zeros((50, 100, 3), np.uint8), Depth(*np.zeros((2, 50, 100), np.float32)), None)
+    monkeypatch.setattr(moving, "find_depths", lambda images, *_: iter([shot] * len(images.files)))
+    _, masks, doubt = find_moving(aside(*np.arange(9) * 0.1), lambda i: wall())
+    assert not any(mask.any() for mask in masks) and "nothing is masked: 10% of the width" in doubt
+    assert "People who walk along may be left in" in doubt
+    assert moving.spacing_of(aside(*np.arange(9) * 0.02), lambda i: wall()) == pytest.approx(0.02)
+    assert moving.spacing_of(aside(*np.arange(9) * 0.1), lambda i: wall(5)) == 0.0, "too few points to tell"
