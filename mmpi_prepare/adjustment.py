@@ -11,13 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from mmpi_ns.utils.errors import InputError, progress, say
+from mmpi_prepare.gps import Array, Fit
 from mmpi_priors.sfm import MIN_ANGLE, quiet, triangulate_points, verified_matches
 from mmpi_priors.upright import level_up
 
-Array = NDArray[np.float64]
 STILL = 1e-6
 """Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive
 that took four times as long, and moved the focal length by 0.002 px."""
@@ -383,11 +382,14 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     return normal, float(np.median((centers - center) @ normal))
 
 
-def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> tuple[pycolmap.Sim3d, str, str]:
+def choose_frame(
+    model: pycolmap.Reconstruction, camera_height: float | None, gps: Fit | None = None
+) -> tuple[pycolmap.Sim3d, str, str]:
     """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
 
     Without a ground, cameras are assumed level: up is perpendicular to all right vectors if they turn, else the mean up
-    vector. Without ``camera_height``, in metres above the ground, one unit is the extent of the track.
+    vector. Without ``camera_height``, in metres above the ground, scale and up are those of ``gps``; without both, one
+    unit is the extent of the track.
 
     Returns the transform from the model to the scene, and the sources of up and of the unit in words.
     """
@@ -404,6 +406,9 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
             raise InputError("--camera-height: the ground found lies above the cameras.")
         scale, words = camera_height / height, "normal of the ground"
         unit = f"1 metre, from a camera height of {camera_height:g} m above the ground"
+    elif gps is not None:
+        scale, unit = gps.scale, f"1 metre, from {gps.says} m"
+        up, words = (up, words) if gps.up is None else (gps.up, "GPS")
     else:
         extent = float(np.ptp(centers @ np.linalg.svd(centers - centers.mean(0))[2][0]))
         scale, unit = 1 / max(extent, 1e-12), "the extent of the camera track (metres are not known)"

@@ -24,6 +24,7 @@ from mmpi_ns.utils.files import whole, write_text
 from mmpi_ns.utils.values import check_options
 from mmpi_prepare import checks, export, features, images
 from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_known_poses
+from mmpi_prepare.gps import find_fit
 from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_prepare.mapping import Task, map_and_judge
 from mmpi_prepare.poses import GIVEN_COUNTS, agreeing, make_cameras, opencv_camera, read_poses
@@ -226,7 +227,10 @@ class Preparation:
             focal = f"that of EXIF kept; by the images alone {focal}"
         up = unit = "that of the given poses"
         if self.known_poses is None or s.camera_height is not None:
-            similarity, up, unit = choose_frame(model, s.camera_height)
+            names, poses = camera_poses(model)
+            places = {p.name: p.place for p in self.photos}
+            gps = find_fit(poses, [places[n] for n in names]) if s.camera_height is None else None
+            similarity, up, unit = choose_frame(model, s.camera_height, gps)
             model.transform(similarity)
         names = set(camera_poses(model)[0])
         photos = [p for p in self.photos if p.name in names]
