@@ -24,7 +24,8 @@ from mmpi_ns.utils.files import whole, write_text
 from mmpi_ns.utils.values import check_options
 from mmpi_prepare import checks, export, features, images
 from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_known_poses
-from mmpi_prepare.gps import find_fit
+from mmpi_prepare.depths import find_depths, metres_of, write_depths
+from mmpi_prepare.gps import Fit, find_fit
 from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_prepare.mapping import Task, map_and_judge
 from mmpi_prepare.poses import GIVEN_COUNTS, agreeing, make_cameras, opencv_camera, read_poses
@@ -135,6 +136,7 @@ class Preparation:
         if s.masks is not None:
             stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
             self.masks, _ = self._stage("masks", stamps, partial(images.gather_masks, s.masks, self.photos))
+        self.depths = find_depths(s.depths, self.photos) if s.depths is not None else {}
         self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
         if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
             raise InputError(
@@ -226,11 +228,16 @@ class Preparation:
         if self.mapped["focal"] and keeps_focals(model, self.cameras):
             focal = f"that of EXIF kept; by the images alone {focal}"
         up = unit = "that of the given poses"
+        metres, told = metres_of(model, self.depths) if self.depths else (1.0, "not given")
+        scale = 1.0
         if self.known_poses is None or s.camera_height is not None:
             names, poses = camera_poses(model)
             places = {p.name: p.place for p in self.photos}
-            gps = find_fit(poses, [places[n] for n in names]) if s.camera_height is None else None
-            similarity, up, unit = choose_frame(model, s.camera_height, gps)
+            fit = Fit(metres, None, told) if self.depths else None
+            if s.camera_height is None and not self.depths:
+                fit = find_fit(poses, [places[n] for n in names])
+            similarity, up, unit = choose_frame(model, s.camera_height, fit)
+            scale = similarity.scale
             model.transform(similarity)
         names = set(camera_poses(model)[0])
         photos = [p for p in self.photos if p.name in names]
@@ -246,11 +253,15 @@ class Preparation:
             model, photos = export.undistort(model, photos, folder, masks, flat, s.threads)
             folder, masks = flat / "images", flat / "masks" if masks else None
         export.write_images(folder, masks, photos, built, s.downscales)
+        depths = write_depths(self.depths, photos, scale / metres, built, s.downscales) if self.depths else {}
+        if depths:
+            say(f"Depths: {told}; a metre is {scale / metres:.4g} units of the scene.")
         notes = {"unit": unit, "up": up, "mapping": says, "matching": self.matching}
         (built / "colmap/sparse/0").mkdir(parents=True)
         model.write(built / "colmap/sparse/0")
         model.export_PLY(built / "sparse_pc.ply")
-        write_text(built / "transforms.json", json.dumps(export.transforms(model, split, bool(masks), notes), indent=1))
+        content = export.transforms(model, split, bool(masks), depths, notes)
+        write_text(built / "transforms.json", json.dumps(content, indent=1))
         rows = {
             "images registered": f"{len(photos)} of {len(self.photos)}",
             "matching": self.matching,
@@ -259,6 +270,7 @@ class Preparation:
             "focal length": focal,
             "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
             "what moves": moves,
+            "depths": told,
             "up": up,
             "unit": unit,
             "split": f"{len(split.train)} train, {len(split.test)} test: {split.says}",
@@ -389,6 +401,8 @@ def prepare(s: Settings) -> Verdict:
         "--refine-poses refines known poses: give them with --poses.": s.refine_poses and s.poses is None,
         f"--poses {s.poses} does not exist.": s.poses is not None and not s.poses.exists(),
         f"--masks {s.masks} is no folder.": s.masks is not None and not s.masks.is_dir(),
+        f"--depths {s.depths} is no folder.": s.depths is not None and not s.depths.is_dir(),
+        "--depths are of images with their lens: leave --undistort out.": s.depths is not None and s.undistort,
         f"There is no {looked_at(s.input)}: check the path.": not source.exists(),
         f"{s.scene} is a file: name a folder for the scene.": s.scene.is_file(),
     }
