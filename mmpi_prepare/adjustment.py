@@ -6,18 +6,17 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from mmpi_ns.utils.errors import InputError, progress, say
+from mmpi_prepare.gps import Array, Fit
 from mmpi_priors.sfm import MIN_ANGLE, quiet, triangulate_points, verified_matches
 from mmpi_priors.upright import level_up
 
-Array = NDArray[np.float64]
 STILL = 1e-6
 """Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive
 that took four times as long, and moved the focal length by 0.002 px."""
@@ -263,6 +262,13 @@ def open_focals(model: pycolmap.Reconstruction, database: Path, threads: int) ->
     return noted if is_open else {}
 
 
+def keeps_focals(model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera]) -> bool:
+    """Whether all cameras of a model have kept the focal lengths that EXIF gave ``cameras``, those of the database."""
+    noted = {i: c.mean_focal_length() for i, c in enumerate(cameras, 1) if c.has_prior_focal_length}
+    used = {i: c.mean_focal_length() for i, c in model.cameras.items()}
+    return all(i in noted and np.isclose(focal, noted[i], 1e-6) for i, focal in used.items())
+
+
 def map_known_poses(
     model: pycolmap.Reconstruction, database: Path, images: Path, refine_poses: bool, refine_lens: bool, threads: int
 ) -> tuple[pycolmap.Reconstruction, str]:
@@ -376,11 +382,14 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     return normal, float(np.median((centers - center) @ normal))
 
 
-def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> tuple[pycolmap.Sim3d, str, str]:
+def choose_frame(
+    model: pycolmap.Reconstruction, camera_height: float | None, gps: Fit | None = None
+) -> tuple[pycolmap.Sim3d, str, str]:
     """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
 
     Without a ground, cameras are assumed level: up is perpendicular to all right vectors if they turn, else the mean up
-    vector. Without ``camera_height``, in metres above the ground, one unit is the extent of the track.
+    vector. Without ``camera_height``, in metres above the ground, scale and up are those of ``gps``; without both, one
+    unit is the extent of the track.
 
     Returns the transform from the model to the scene, and the sources of up and of the unit in words.
     """
@@ -397,6 +406,9 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
             raise InputError("--camera-height: the ground found lies above the cameras.")
         scale, words = camera_height / height, "normal of the ground"
         unit = f"1 metre, from a camera height of {camera_height:g} m above the ground"
+    elif gps is not None:
+        scale, unit = gps.scale, f"1 metre, from {gps.says} m"
+        up, words = (up, words) if gps.up is None else (gps.up, "GPS")
     else:
         extent = float(np.ptp(centers @ np.linalg.svd(centers - centers.mean(0))[2][0]))
         scale, unit = 1 / max(extent, 1e-12), "the extent of the camera track (metres are not known)"

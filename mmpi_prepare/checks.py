@@ -18,8 +18,8 @@ from mmpi_prepare.adjustment import WIDE, Array, adjust, camera_poses, degrees_b
 from mmpi_prepare.evidence import local_median
 from mmpi_prepare.images import in_short
 
-BLURRED = 0.4
-"""Fraction of its neighbours' sharpness below which an image counts as blurred."""
+BLURRED, BESIDE = 0.4, 3
+"""Fraction of its neighbours' sharpness below which a frame counts as blurred, and neighbours on either side."""
 JUMP, TURN = 5.0, 8.0
 """Times its neighbours' step (or turn) from which a step counts as a jump; minimum angle of such a turn, degrees."""
 FOCAL_OFF, FOCAL_HELPS = (0.03, 0.05), (0.95, 0.85)
@@ -57,16 +57,17 @@ def by_kind(findings: Sequence[Finding]) -> list[str]:
     return lines
 
 
-def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:
-    """Images much less sharp than their neighbours (or than all others, if the images are not in order)."""
-    usual = local_median(sharp, 7) if ordered else np.full(len(sharp), np.median(sharp))
-    share = sharp / np.maximum(usual, 1e-12)
-    what = "its neighbours" if ordered else "the others"
-    return [
-        Finding("blurred?", names[i], f"{share[i]:.0%} as sharp as {what}", -share[i])
-        for i in range(len(names))
-        if share[i] < BLURRED
-    ]
+def blurred(names: Sequence[str], sharp: Array) -> list[Finding]:
+    """Frames of a sequence that are much less sharp than those before and those after them: a pan may end at, and a
+    walk turn to, something that has no detail."""
+    findings = []
+    for i in range(BESIDE, len(names) - BESIDE):
+        usual = min(np.median(sharp[i - BESIDE : i]), np.median(sharp[i + 1 : i + 1 + BESIDE]))
+        share = float(sharp[i] / max(usual, 1e-12))
+        if share < BLURRED:
+            says = f"{share:.0%} as sharp as frames before and after it: leave it out if it looks blurred"
+            findings.append(Finding("blurred?", names[i], says, -share))
+    return findings
 
 
 def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list[Finding]:

@@ -23,7 +23,7 @@ from mmpi_priors.sfm import quiet
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 """Written explicitly: without it, nerfstudio-data assumes an axis swap if colmap/sparse/0 exists."""
-PART = re.compile(r"(images|masks)(_\d+)?|colmap|sparse_pc\.ply|report\.md|report|transforms\.json")
+PART = re.compile(r"(images|masks|depths)(_\d+)?|colmap|sparse_pc\.ply|report\.md|report|transforms\.json")
 """The parts of a scene."""
 
 
@@ -68,9 +68,12 @@ def split_images(
     return Split(tuple(n for n in names if n in train), tuple(n for n in names if n in test), says)
 
 
-def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes: dict[str, Any]) -> dict[str, Any]:
-    """transforms.json for the registered images; intrinsics that all share are at the top level. Raises InputError if
-    nerfstudio-data reads no scene with these lenses."""
+def transforms(
+    model: pycolmap.Reconstruction, split: Split, masks: bool, depths: Mapping[str, str], notes: dict[str, Any]
+) -> dict[str, Any]:
+    """transforms.json for the registered images; intrinsics that all share are at the top level. ``depths`` are paths
+    of depth images by name of the image, if any. Raises InputError if nerfstudio-data reads no scene with these
+    lenses."""
     lenses = {number: opencv_intrinsics(camera) for number, camera in model.cameras.items()}
     kinds = {is_fisheye for _, is_fisheye in lenses.values()}
     if len(kinds) > 1:
@@ -88,6 +91,8 @@ def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes:
         frame: dict[str, Any] = {"file_path": f"images/{name}"}
         if masks:
             frame["mask_path"] = f"masks/{Path(name).stem}.png"
+        if depths:
+            frame["depth_file_path"] = depths[name]
         frame |= {} if is_shared else entries[camera_of[name]]
         frames.append({**frame, "transform_matrix": (pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()})
     test = [f"images/{n}" for n in split.test]

@@ -51,6 +51,8 @@ FAR_STEPS = (15, 20, 30, 45)
 """Frame distances beyond the overlap that are matched too, because slow stretches need a longer baseline."""
 
 Pairs = list[tuple[int, int]]
+NEXT, IN_ORDER = 3, 0.7
+"""Numbered images are in the order of the motion if more than this share of them are most like one of the next."""
 
 
 def extract(
@@ -109,6 +111,20 @@ def matching_pairs(database: Path) -> list[tuple[int, int]]:
     return [pycolmap.pair_id_to_image_pair(p) for p, n in zip(pairs, inliers, strict=True) if n >= MIN_INLIERS]
 
 
+def are_in_order(database: Path, names: Sequence[str]) -> bool:
+    """Whether images come in the order of the motion: their names are numbered, and most share the most matches with an
+    image next to them."""
+    count = len(names)
+    inliers = np.zeros((count, count), np.int64)
+    with pycolmap.Database.open(database) as opened:
+        for pair, matches in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair)
+            inliers[first - 1, second - 1] = inliers[second - 1, first - 1] = matches
+    matched = np.flatnonzero(inliers.max(-1, initial=0) >= MIN_INLIERS)
+    is_near = np.abs(inliers.argmax(-1) - np.arange(count))[matched] <= max(1, min(NEXT, count // 8))
+    return are_numbered(names) and len(matched) > 0 and bool(is_near.mean() > IN_ORDER)
+
+
 def image_similarity(database: Path, count: int) -> NDArray[np.float32]:
     """Similarity of any two images by their features, at most 1; -1 on the diagonal. [count, count]
 
@@ -156,12 +172,12 @@ def choose_pairs(
     """Pairs (i < j) to match, and how and why they were chosen in words."""
     count, why = len(names), "as asked"
     if matching == "auto":
-        nearest_in_time = np.abs(alike.argmax(-1) - np.arange(count)) <= 3
+        nearest_in_time = np.abs(alike.argmax(-1) - np.arange(count)) <= NEXT
         if count <= FEW:
             matching, why = "exhaustive", f"{count} images are few"
         elif from_video:
             matching, why = "sequential", "frames of a video"
-        elif are_numbered(names) and nearest_in_time.mean() > 0.7:
+        elif are_numbered(names) and nearest_in_time.mean() > IN_ORDER:
             matching, why = "sequential", "numbered frames that look like their neighbours"
         elif count <= MANY:
             matching, why = "exhaustive", f"{count} images in no order"

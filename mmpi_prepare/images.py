@@ -19,6 +19,7 @@ from PIL import ExifTags, Image, ImageOps
 from mmpi_ns.data.exif import kept_tags, positive_number, tags_of
 from mmpi_ns.utils.errors import InputError, progress, say
 from mmpi_ns.utils.files import opened, whole, write_text
+from mmpi_prepare.gps import Place, place_of
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 HEIF = (".heic", ".heif")
@@ -56,6 +57,8 @@ class Photo:
     """Pixels."""
     source: str = ""
     """Where it came from, below the input folder."""
+    place: Place | None = None
+    """By the GPS of EXIF, as ``place_of`` has it."""
 
 
 def find_images(folder: Path) -> list[Path]:
@@ -142,7 +145,8 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
             lens = " ".join(str(part).strip() for part in parts if part)
             focal = positive_number(shot.get(FOCAL_TAGS[1]))
             focal = focal and focal / FILM_WIDTH * max(size)
-            photos.append(Photo(name, *size, lens, focal, str(file.relative_to(folder))))
+            place = place_of(exif.get_ifd(ExifTags.IFD.GPSInfo))
+            photos.append(Photo(name, *size, lens, focal, str(file.relative_to(folder)), place))
             advance(1)
     return photos
 

@@ -169,8 +169,7 @@ def _run(
         before = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
         if before:
             say(f"Mapping, {attempt.name}: goes on from {before} images.")
-        # An attempt that fails is reported in words.
-        with progress(f"Mapping, {attempt.name}", total) as advance, quiet(shows_errors=False):
+        with progress(f"Mapping, {attempt.name}", total) as advance, quiet():
             advance(before)
             models = pycolmap.incremental_mapping(
                 database,

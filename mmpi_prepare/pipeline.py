@@ -23,7 +23,9 @@ from mmpi_ns.utils.errors import FULL, InputError, looked_at, progress, quoted, 
 from mmpi_ns.utils.files import whole, write_text
 from mmpi_ns.utils.values import check_options
 from mmpi_prepare import checks, export, features, images
-from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, map_known_poses
+from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_known_poses
+from mmpi_prepare.depths import find_depths, metres_of, write_depths
+from mmpi_prepare.gps import Fit, find_fit
 from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_prepare.mapping import Task, map_and_judge
 from mmpi_prepare.poses import GIVEN_COUNTS, agreeing, make_cameras, opencv_camera, read_poses
@@ -70,6 +72,8 @@ class Preparation:
         source = [s.matching, s.overlap, poses]
         folder, self.matching = self._stage("matches", source, partial(self._match, folder / features.DATABASE))
         say(f"Matching: {self.matching}.")
+        names = [p.name for p in self.photos]
+        self.is_ordered = self.is_video or features.are_in_order(folder / features.DATABASE, names)
         source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
         folder, self.mapped = self._stage("model", source, partial(self._map, folder / features.DATABASE))
         model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
@@ -115,8 +119,7 @@ class Preparation:
         return folder, state["result"]
 
     def _read(self) -> None:
-        """Images, masks and known poses, whether the images come in the order of the motion, and their cameras with
-        whether intrinsics are to be kept."""
+        """Images, masks and known poses, and their cameras with whether intrinsics are to be kept."""
         s = self.settings
         self.is_video = s.input.is_file()
         if self.is_video and s.input.suffix.lower() not in images.VIDEOS:
@@ -129,11 +132,11 @@ class Preparation:
             read = partial(select_frames, s.input, max_frames=s.max_frames, step=s.frame_motion)
         _, entries = self._stage("input", source, lambda folder: [asdict(photo) for photo in read(folder)])
         self.photos = [Photo(**entry) for entry in entries]
-        self.is_ordered = self.is_video or features.are_numbered([p.name for p in self.photos])
         self.masks = None
         if s.masks is not None:
             stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
             self.masks, _ = self._stage("masks", stamps, partial(images.gather_masks, s.masks, self.photos))
+        self.depths = find_depths(s.depths, self.photos) if s.depths is not None else {}
         self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
         if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
             raise InputError(
@@ -221,9 +224,20 @@ class Preparation:
     def _write(self, model: pycolmap.Reconstruction, verdict: Verdict) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
         s, says = self.settings, self.mapped["says"]
+        focal = self.mapped["focal"][1] if self.mapped["focal"] else "given"
+        if self.mapped["focal"] and keeps_focals(model, self.cameras):
+            focal = f"that of EXIF kept; by the images alone {focal}"
         up = unit = "that of the given poses"
+        metres, told = metres_of(model, self.depths) if self.depths else (1.0, "not given")
+        scale = 1.0
         if self.known_poses is None or s.camera_height is not None:
-            similarity, up, unit = choose_frame(model, s.camera_height)
+            names, poses = camera_poses(model)
+            places = {p.name: p.place for p in self.photos}
+            fit = Fit(metres, None, told) if self.depths else None
+            if s.camera_height is None and not self.depths:
+                fit = find_fit(poses, [places[n] for n in names])
+            similarity, up, unit = choose_frame(model, s.camera_height, fit)
+            scale = similarity.scale
             model.transform(similarity)
         names = set(camera_poses(model)[0])
         photos = [p for p in self.photos if p.name in names]
@@ -239,19 +253,24 @@ class Preparation:
             model, photos = export.undistort(model, photos, folder, masks, flat, s.threads)
             folder, masks = flat / "images", flat / "masks" if masks else None
         export.write_images(folder, masks, photos, built, s.downscales)
+        depths = write_depths(self.depths, photos, scale / metres, built, s.downscales) if self.depths else {}
+        if depths:
+            say(f"Depths: {told}; a metre is {scale / metres:.4g} units of the scene.")
         notes = {"unit": unit, "up": up, "mapping": says, "matching": self.matching}
         (built / "colmap/sparse/0").mkdir(parents=True)
         model.write(built / "colmap/sparse/0")
         model.export_PLY(built / "sparse_pc.ply")
-        write_text(built / "transforms.json", json.dumps(export.transforms(model, split, bool(masks), notes), indent=1))
+        content = export.transforms(model, split, bool(masks), depths, notes)
+        write_text(built / "transforms.json", json.dumps(content, indent=1))
         rows = {
             "images registered": f"{len(photos)} of {len(self.photos)}",
             "matching": self.matching,
             "mapping": says,
             "verdict": f"{verdict.grade} {verdict.says}".strip(),
-            "focal length": self.mapped["focal"][1] if self.mapped["focal"] else "given",
+            "focal length": focal,
             "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
             "what moves": moves,
+            "depths": told,
             "up": up,
             "unit": unit,
             "split": f"{len(split.train)} train, {len(split.test)} test: {split.says}",
@@ -282,7 +301,8 @@ class Preparation:
     ) -> tuple[list[checks.Finding], Path | None, str]:
         """Findings on the scene to be built; the folder of its masks, given or of what moves; what moves in words."""
         s, names, sharp = self.settings, [p.name for p in photos], np.zeros(len(photos))
-        findings = checks.doubtful_intrinsics(model, self.is_fixed, self.mapped["focal"], s.threads)
+        focal = None if keeps_focals(model, self.cameras) else self.mapped["focal"]
+        findings = checks.doubtful_intrinsics(model, self.is_fixed, focal, s.threads)
         with progress("Checking images", len(names)) as advance:
             for i, name in enumerate(names):
                 gray = cv2.imread(str(self.image_folder / name), cv2.IMREAD_GRAYSCALE)
@@ -290,8 +310,8 @@ class Preparation:
                     raise InputError(f"{name} cannot be read: repair or remove it.")
                 sharp[i] = sharpness(gray)  # type: ignore[arg-type]
                 advance(1)
-        findings += checks.blurred(names, sharp, self.is_ordered)
         if self.is_ordered:
+            findings += checks.blurred(names, sharp)
             order, poses = camera_poses(model)
             offered = [p.name for p in self.photos]
             findings += checks.misplaced(order, [offered.index(n) for n in order], poses)
@@ -303,7 +323,7 @@ class Preparation:
         moves, doubt = write_masks(model, photos, split.train, self.image_folder, target, picture, s.threads)
         findings += [checks.Finding("moving?", "", doubt)] if doubt else []
         if not moves:
-            return findings, None, "nothing is seen to move"
+            return findings, None, "not known" if doubt else "nothing is seen to move"
         moving, fate = sum(moves.values()) / len(split.train), "are masked" if s.moving == "mask" else "move"
         says = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
         say(f"What moves: {says}; report/moving.jpg shows them.")
@@ -381,6 +401,8 @@ def prepare(s: Settings) -> Verdict:
         "--refine-poses refines known poses: give them with --poses.": s.refine_poses and s.poses is None,
         f"--poses {s.poses} does not exist.": s.poses is not None and not s.poses.exists(),
         f"--masks {s.masks} is no folder.": s.masks is not None and not s.masks.is_dir(),
+        f"--depths {s.depths} is no folder.": s.depths is not None and not s.depths.is_dir(),
+        "--depths are of images with their lens: leave --undistort out.": s.depths is not None and s.undistort,
         f"There is no {looked_at(s.input)}: check the path.": not source.exists(),
         f"{s.scene} is a file: name a folder for the scene.": s.scene.is_file(),
     }
@@ -396,5 +418,5 @@ def prepare(s: Settings) -> Verdict:
             f"{s.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite (the old files are "
             "then moved aside)."
         )
-    with only_one(s.scene / WORK):
+    with only_one(s.scene / WORK), quiet():
         return Preparation(s).run()

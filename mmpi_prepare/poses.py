@@ -28,8 +28,8 @@ GIVEN_COUNTS = {3: "f cx cy", 4: "fx fy cx cy", 8: "fx fy cx cy k1 k2 p1 p2"}
 MAX_LAG = 0.05
 """Maximum time in seconds between an image and its pose."""
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-KIND = re.compile(r"[._-]?(pose|color|rgb|image)s?$", re.IGNORECASE)
-"""End of a name that differs between images and poses: frame-000001.color.png, frame-000001.pose.txt."""
+KIND = re.compile(r"[._-]?(pose|color|rgb|image|depth)s?$", re.IGNORECASE)
+"""End of a name that differs between images, poses and depths: frame-000001.color.png, frame-000001.pose.txt."""
 
 
 def opencv_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:

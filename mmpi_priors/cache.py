@@ -21,7 +21,7 @@ from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.utils.arrays import Arrays, Pairs, write_arrays
 from mmpi_ns.utils.files import cache_folder, write_atomically
 
-VERSION = 1
+VERSION = 2
 """Of all that is kept: results of another version are found anew."""
 KEPT = 24
 """Number of cached results; the least recently used is removed first."""

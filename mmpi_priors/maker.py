@@ -47,7 +47,8 @@ class CapturePriors(PriorsMaker):
             masks, doubt = self._moving(observations)
             masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
             movers, is_masked = share_of_moving(masks), any(mask.any() for mask in masks)
-            say(movers + (" (--pipeline.datamanager.priors.mask-moving False keeps them)." if is_masked else "."))
+            if is_masked or not doubt:
+                say(movers + (" (--pipeline.datamanager.priors.mask-moving False keeps them)." if is_masked else "."))
             if doubt:
                 say(doubt, "yellow")
             if is_masked:

@@ -27,7 +27,7 @@ from mmpi_ns.utils.errors import duration
 from mmpi_ns.utils.files import opened
 from mmpi_ns.utils.parallel import in_order, num_threads, one_thread_each
 from mmpi_priors.cache import Arrays, Computed, kept
-from mmpi_priors.dense import Depth, Progress, find_depths
+from mmpi_priors.dense import Depth, Progress, find_depths, mean_and_contrast
 from mmpi_priors.moving_carry import Carried, carried
 from mmpi_priors.moving_doubt import doubt_of
 from mmpi_priors.moving_evidence import Evidence, Mask, Neighbour, Shot, evidence, ground_of, horizon_of
@@ -61,6 +61,11 @@ COMPARED, FIRST, FEW = 0.02, 0.06, 30
 """Median distance between points in a key image and in the next one, in widths, at most: of those that others are
 compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
 first. Fewer points tell nothing."""
+KNOWN, CONTRAST = 0.5, 3.0
+"""Share of the textured pixels (standard deviation of gray levels around them) whose depths other images confirm, in
+half of the images at least, or nothing is masked: where most pixels are unexplained, what moves is not told from what
+is hidden or was not found again. Of a procedural walk 0.62 are known and 90 % of the people are masked, of every third
+of its images 0.52 and 21 %; of a film of one frame a second 0.39, and rocks were masked instead of the man."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
 SHOWN, COLUMNS, WIDTH = 24, 4, 320
@@ -95,6 +100,14 @@ def find_moving(
     near = [neighbours(images, i, keys) for i in range(len(shots))]
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
     nothing, first = masks.copy(), {}
+    known = float(np.median([share_known(shot) for shot in shots]))
+    if known < KNOWN:
+        says = (
+            f"What moves is not known and nothing is masked: other images confirm the depths of {known:.0%} of the "
+            "textured pixels alone, too few to tell what moves from what is hidden. People who walk along may be left "
+            "in: take images closer together, or mask them by hand (mask_path)."
+        )
+        return [shot.view for shot in shots], nothing, says
 
     def look(i: int) -> tuple[Mask, _Look]:
         return _moves(shots, near[i], i, nothing, nothing[i], None)
@@ -150,6 +163,12 @@ def key_images(images: PosedImages, points_of: Callable[[int], NDArray[np.float6
         far = (j for j in range(first + 1, last + 1) if not shift(first, j) < spacing)
         keys.append(max(first + 1, next(far, last + 1) - 1))
     return keys
+
+
+def share_known(shot: Shot) -> float:
+    """Share of the textured pixels of a shot that have a depth; 1 where there is no texture."""
+    textured = shot.view.inside & (mean_and_contrast(shot.view.gray)[1] > CONTRAST)
+    return float((shot.depth.inverse > 0)[textured].mean()) if textured.any() else 1.0
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:
@@ -216,8 +235,8 @@ def share_of_moving(masks: Sequence[Mask]) -> str:
         return "Nothing is seen to move in the training images"
     count = np.count_nonzero(shares)
     return (
-        f"{100 * shares.mean():.1f} % of the training pixels, in {count} of {len(masks)} images, show what moves and "
-        "are masked"
+        f"{100 * shares.mean():.1f} % of the training pixels, in {count} of {len(masks)} images, seem to move and are "
+        "masked"
     )
 
 

@@ -141,10 +141,10 @@ def numbers_in_model(files: Sequence[Path], names: Sequence[str]) -> NDArray[np.
 
 
 @contextmanager
-def quiet(shows_errors: bool = True) -> Iterator[None]:
-    """Keeps COLMAP's log to errors, or to what ends the program."""
+def quiet() -> Iterator[None]:
+    """Keeps COLMAP's log to what ends the program: errors are exceptions too, which are said in words."""
     log = load_pycolmap().logging
-    level, log.minloglevel = log.minloglevel, int(log.Level.ERROR if shows_errors else log.Level.FATAL)
+    level, log.minloglevel = log.minloglevel, int(log.Level.FATAL)
     try:
         yield
     finally:

@@ -55,3 +55,13 @@ def write_images(folder: Path, count=14, seed=0, start=0, bend=0.01):
     for i, pose in enumerate(chosen):
         Image.fromarray(picture(pose, seed)).save(folder / f"frame_{start + i + 1:03d}.png")
     return chosen
+
+
+def depth(pose):
+    """Metres along the optical axis. [HEIGHT, WIDTH]"""
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(columns - WIDTH / 2) / FOCAL, (rows - HEIGHT / 2) / FOCAL, np.ones_like(columns)], -1)
+    rays = rays @ pose[:3, :3].T
+    with np.errstate(divide="ignore"):
+        distances = np.stack([(place - pose[axis, 3]) / rays[..., axis] for axis, place, _ in PLANES])
+    return np.where(distances > 0, distances, np.inf).min(0)

@@ -108,8 +108,13 @@ class Gains:
                 f"Exposure is not corrected: where images show the same, colours differ by {before:.1f} %, but too few "
                 f"surfaces are shared to tell by how much exposures do (expected error {error:.1f} %)."
             )
+        if not self.matter and self.confirmed:
+            return f"Exposure hardly varies: where images show the same, colours differ by {before:.1f} %."
         if not self.matter:
-            return f"Exposure: equal to within {before:.1f} % where images show the same."
+            return (
+                f"Exposure is not corrected: where images show the same, colours differ by {before:.1f} %, and a "
+                "factor for each image does not lessen that."
+            )
         return (
             f"Exposure varies {self.span:.2f}-fold between images and is corrected: where two show the same, colours "
             f"that differed by {before:.1f} % differ by {after:.1f} %."

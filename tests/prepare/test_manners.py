@@ -21,6 +21,7 @@ from mmpi_prepare import images
 from mmpi_prepare.checks import Finding, by_kind
 from mmpi_prepare.pipeline import WORK, only_one, prepare
 from mmpi_prepare.settings import Settings
+from mmpi_priors.sfm import quiet
 
 NAN = float("nan")
 
@@ -191,3 +192,11 @@ def test_the_exit_status_is_that_of_the_work(ends, status, words):
     )
     ended = subprocess.run([sys.executable, "-c", program], check=False, stderr=subprocess.PIPE, text=True)
     assert ended.returncode == status and (words in ended.stderr if words else not ended.stderr)
+
+
+def test_errors_of_colmap_are_said_in_words_alone(capfd):
+    with quiet():
+        pycolmap.logging.error("a line of C++")
+    assert "a line of C++" not in capfd.readouterr().err
+    pycolmap.logging.error("a line of C++")
+    assert "a line of C++" in capfd.readouterr().err

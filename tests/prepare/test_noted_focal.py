@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from test_prepare_parts import model_of
 
-from mmpi_prepare.adjustment import open_focals, with_focals
+from mmpi_prepare.adjustment import keeps_focals, open_focals, with_focals
 
 TRUE, LENS = 300.0, {"model": "SIMPLE_RADIAL", "width": 200, "height": 160, "camera_id": 1}
 
@@ -72,3 +72,12 @@ def test_only_focal_lengths_of_exif_are_noted(tmp_path, capsys):
     assert open_focals(model, database, 1) == {} and "EXIF" not in capsys.readouterr().out
     other = noting(noting(tmp_path / "two.db", TRUE), TRUE, known=False)
     assert open_focals(model, other, 1) == {1: TRUE}
+
+
+@pytest.mark.parametrize(
+    ("focal", "known", "keeps"), [(TRUE, True, True), (1.01 * TRUE, True, False), (TRUE, False, False)]
+)
+def test_a_kept_focal_length_is_that_of_exif(focal, known, keeps):
+    camera = pycolmap.Camera(params=[TRUE, 100, 80, 0.0], **LENS)
+    camera.has_prior_focal_length = known
+    assert keeps_focals(a_flight(0.0, focal), [camera]) == keeps

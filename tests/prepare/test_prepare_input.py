@@ -405,8 +405,29 @@ def test_jump_and_turn_of_the_track_are_found():
     assert {f.image for f in checks.misplaced(names, range(20), turned)} == {"f09", "f10"}
 
 
-def test_blurred_image_is_found():
-    images = [cv2.cvtColor(corridor.picture(p), cv2.COLOR_RGB2GRAY) for p in corridor.poses(6)]
-    images[3] = cv2.GaussianBlur(images[3], (0, 0), 2)
+def test_a_blurred_frame_is_found_and_the_plain_end_of_a_pan_is_not_called_blurred():
+    images = [cv2.cvtColor(corridor.picture(p), cv2.COLOR_RGB2GRAY) for p in corridor.poses(9)]
+    images[4] = cv2.GaussianBlur(images[4], (0, 0), 2)
+    images[8] = cv2.GaussianBlur(images[8], (0, 0), 4)
     sharp = np.array([sharpness(i) for i in images])
-    assert [f.image for f in checks.blurred(list("abcdef"), sharp, True)] == ["d"]
+    assert [f.image for f in checks.blurred(list("abcdefghi"), sharp)] == ["e"]
+    dark = np.array([1.0] * 6 + [0.2] * 6)
+    assert checks.blurred(list("abcdefghijkl"), dark) == [], "a walk into a dark room"
+
+
+def test_numbers_in_names_are_an_order_only_where_the_matches_support_it(tmp_path):
+    names = [f"{i:02d}.png" for i in range(25)]
+    shuffled = np.random.default_rng(0).permutation(25)
+    for order, is_ordered in ((np.arange(25), True), (shuffled, False)):
+        database = tmp_path / f"{is_ordered}.db"
+        with pycolmap.Database.open(database) as opened:
+            camera = opened.write_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=4, height=4, params=[4, 2, 2]))
+            for name in names:
+                opened.write_image(pycolmap.Image(name=name, camera_id=camera))
+            for i in range(25):
+                for j in range(i):
+                    geometry, matches = pycolmap.TwoViewGeometry(), 200 - 7 * abs(int(order[i]) - int(order[j]))
+                    geometry.inlier_matches = np.tile(np.arange(max(matches, 1))[:, None], 2).astype(np.uint32)
+                    opened.write_two_view_geometry(j + 1, i + 1, geometry)
+        assert features.are_in_order(database, names) == is_ordered
+        assert not features.are_in_order(database, [f"{n}_{25 - i}" for i, n in enumerate("abcdefghijklmnopqrstuvwxy")])

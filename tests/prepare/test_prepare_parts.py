@@ -184,20 +184,20 @@ def test_images_of_several_cameras_state_their_own_intrinsics():
         for n in (1, 2)
     ]  # fmt: skip
     split = export.Split(("0.jpg",), ("1.jpg", "2.jpg"), "")
-    content = export.transforms(model_of(corridor.poses(3), *cameras), split, True, {})
+    content = export.transforms(model_of(corridor.poses(3), *cameras), split, True, {}, {})
     assert content["camera_model"] == "OPENCV_FISHEYE" and "fl_x" not in content
     found = [[f[k] for k in ("file_path", "mask_path", "fl_x", "h", "k3", "k4")] for f in content["frames"]]
     assert found == [[f"images/{i}.jpg", f"masks/{i}.png", 151 + i % 2, 161 + i % 2, 0.02, 1 + i % 2] for i in range(3)]
     assert content["train_filenames"] == ["images/0.jpg"]
     assert content["test_filenames"] == content["val_filenames"] == ["images/1.jpg", "images/2.jpg"]
     (shared,) = cameras[:1]
-    content = export.transforms(model_of(corridor.poses(2), shared), split, False, {})
+    content = export.transforms(model_of(corridor.poses(2), shared), split, False, {}, {})
     assert (
         content["fl_x"] == 151 and content["k4"] == 1 and set(content["frames"][0]) == {"file_path", "transform_matrix"}
     )
     mixed = [shared, pycolmap.Camera(model="PINHOLE", params=[9, 9, 4, 3], width=8, height=6, camera_id=3)]
     with pytest.raises(InputError, match="Fisheye and perspective"):
-        export.transforms(model_of(corridor.poses(2), *mixed), split, False, {})
+        export.transforms(model_of(corridor.poses(2), *mixed), split, False, {}, {})
 
 
 @pytest.mark.parametrize("mask", [False, True])

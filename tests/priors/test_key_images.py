@@ -97,3 +97,23 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     images = PosedImages((Path("x"),) * 5, poses, np.ones((5, 4)), np.tile([50.0, 20], (5, 1)), np.zeros((5, 4)))
     _, masks, _ = find_moving(images, lambda i: np.zeros((0, 3)))
     assert [int(mask.sum()) for mask in masks] == ([13, 26, 13, 13, 13] if large else [0] * 5)
+
+
+@pytest.mark.parametrize(("known", "is_told"), [(0.45, False), (0.55, True)])
+def test_nothing_is_masked_where_most_depths_are_unknown(monkeypatch, known, is_told):
+    """Of the textured half of the images; the plain half, which cannot be matched, does not count."""
+    gray = np.zeros((50, 100), np.uint8)
+    gray[:, :50] = np.random.default_rng(0).integers(0, 255, (50, 50))
+    inverse = np.zeros((50, 100), np.float32)
+    inverse[: round(50 * known)] = 1
+    view = View(gray, np.ones(4), np.eye(4)[:3], np.ones((50, 100), bool))
+    shot = Shot(view, np.zeros((50, 100, 3), np.uint8), Depth(inverse, inverse), None)
+    monkeypatch.setattr(moving, "find_depths", lambda images, *_: iter([shot] * len(images.files)))
+    monkeypatch.setattr(moving, "_moves", lambda *_: (np.ones((50, 100), bool), None))
+    for name in ("_followed_on", "_outlined"):
+        monkeypatch.setattr(moving, name, lambda shots, near, masks, *_: masks)
+    assert moving.share_known(shot) == pytest.approx(known, abs=0.02)
+    _, masks, doubt = find_moving(aside(*np.arange(5) * 0.02), lambda i: wall())
+    assert all(mask.any() == is_told for mask in masks)
+    said = f"confirm the depths of {moving.share_known(shot):.0%} of the textured pixels alone"
+    assert (said in doubt and "People who walk along may be left in" in doubt) == (not is_told)

@@ -15,7 +15,7 @@ AHEAD, ASIDE = np.eye(3), np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 HEIGHT, SHAPE = 1.5, (40, 60)
 
 
-def shots_of(count=MANY, sunken=0.0, heights=HEIGHT, turn=AHEAD, has_ground=True, known=1.0, seed=0):
+def shots_of(count=MANY, sunken=0.0, heights=HEIGHT, turn=AHEAD, has_ground=True, known=1.0, seed=0, step=2.0):
     """A drive along the first axis; a share of the road's pixels, which are noisy, belongs to cars with the speed
     0.9 of the camera's, which seem ten times as far."""
     random, shots = np.random.default_rng(seed), []
@@ -25,7 +25,7 @@ def shots_of(count=MANY, sunken=0.0, heights=HEIGHT, turn=AHEAD, has_ground=True
         inverse = np.where(down > 0, down / height, 0.02) * random.normal(1, 0.03, SHAPE)
         inverse[(random.random(SHAPE) < sunken) & (down > 0)] *= 0.1
         inverse[random.random(SHAPE) >= known] = 0
-        pose = np.concatenate([FACING @ turn, [[float(i)], [0], [height]]], 1)
+        pose = np.concatenate([FACING @ turn, [[step * i], [0], [height]]], 1)
         view = View(np.zeros(SHAPE, np.uint8), np.array([30.0, 30, 30, 20]), pose, np.ones(SHAPE, bool))
         depth = Depth(inverse.astype(np.float32), np.full(SHAPE, 0.01, np.float32))
         ground = np.maximum(down / height, 0).astype(np.float32) if has_ground else None
@@ -34,7 +34,7 @@ def shots_of(count=MANY, sunken=0.0, heights=HEIGHT, turn=AHEAD, has_ground=True
 
 
 def sunk(shots, masks=None):
-    return share_sunk(shots, UP, masks or [np.zeros(SHAPE, bool) for _ in shots])
+    return share_sunk(shots, UP, masks or [np.zeros(SHAPE, bool) for _ in shots])[0]
 
 
 def doubt(shots, masks=None):
@@ -66,3 +66,19 @@ def test_a_drive_without_a_road_is_doubted_and_a_camera_that_looks_aside_is_not(
     assert f"the road is found in 0 of {MANY} images" in doubt(blind)
     assert not doubt(shots_of(MANY // 4) + blind[MANY // 4 :]), "found in a quarter"
     assert not doubt(shots_of(turn=ASIDE, known=0.0, has_ground=False))
+
+
+def test_of_a_camera_that_is_no_car_nothing_is_said():
+    assert not doubt(shots_of(sunken=0.4, turn=ASIDE)), "it looks aside"
+    assert doubt(shots_of(sunken=0.4)) and not doubt(shots_of(sunken=0.4, heights=30.0)), "a drone far above a shore"
+    for by_hand in (shots_of(known=0.0, has_ground=False), shots_of(sunken=0.4)):
+        for i, shot in enumerate(by_hand):
+            angle = np.radians(1.5 * (i % 2))
+            yaw = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+            shot.view.pose[:, :3] = shot.view.pose[:, :3] @ yaw
+        assert not doubt(by_hand), "a hand turns it"
+
+
+def test_a_doubt_says_for_what_captures_it_is():
+    assert doubt(shots_of(sunken=0.4)).startswith("This looks like a drive along a road.")
+    assert doubt(shots_of(known=0.0, has_ground=False)).startswith("This looks like a drive straight ahead.")

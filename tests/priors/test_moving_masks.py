@@ -105,7 +105,7 @@ def test_masks_of_the_user_win_and_the_option_leaves_all_pixels(drive, manager):
 
 def test_what_moves_is_told_and_drawn(manager, tmp_path):
     dataset, path = manager.train_dataset, tmp_path / "report" / "moving.jpg"
-    assert re.fullmatch(r".* % of the training pixels, in \d of 8 images, show .*", manager.priors.movers)
+    assert re.fullmatch(r".* % of the training pixels, in \d of 8 images, seem to move .*", manager.priors.movers)
     moving.draw_moving(path, [Path(file) for file in dataset.image_filenames], dataset.moving)
     picture = cv2.imread(str(path))
     assert picture.shape == (2 * 180, 4 * 320, 3)
