@@ -14,7 +14,7 @@ import pycolmap
 
 from mmpi_ns.utils.errors import InputError, progress, say
 from mmpi_prepare.gps import Array, Fit
-from mmpi_priors.sfm import MIN_ANGLE, quiet, triangulate_points, verified_matches
+from mmpi_priors.sfm import MIN_ANGLE, triangulate_points, verified_matches
 from mmpi_priors.upright import level_up
 
 STILL = 1e-6
@@ -75,8 +75,7 @@ def adjust(
         config.add_image(image_id)
     if poses:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    with quiet():  # pycolmap.bundle_adjustment cannot be kept quiet
-        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
 
 
@@ -199,8 +198,7 @@ def with_all_points(
     of every second frame of a drive with bends half of the matches became points, with this three quarters.
     """
     for _ in range(rounds):
-        with quiet():
-            model = triangulate_points(model, database, images, threads, LARGEST_ERROR)
+        model = triangulate_points(model, database, images, threads, LARGEST_ERROR)
         adjust(model, threads, lens)
         pycolmap.ObservationManager(model).filter_all_points3D(LARGEST_ERROR, MIN_ANGLE)
         model.update_point_3d_errors()
@@ -278,8 +276,7 @@ def map_known_poses(
     """
     _, before = camera_poses(model)
     refines = refine_poses or refine_lens
-    with quiet():
-        model = triangulate_points(model, database, images, threads, COARSE_PX if refines else FINE_PX)
+    model = triangulate_points(model, database, images, threads, COARSE_PX if refines else FINE_PX)
     matched: dict[int, set[int]] = {i: set() for i in model.reg_image_ids()}  # keypoints with a match in another image
     for *pair, matches in verified_matches(database):
         for i, keypoints in zip(pair, matches.T, strict=True) if all(i in matched for i in pair) else ():
@@ -296,8 +293,7 @@ def map_known_poses(
     if refines:
         for _ in range(REFINE_ROUNDS):
             adjust(model, threads, refine_lens, poses=refine_poses)
-            with quiet():
-                model = triangulate_points(model, database, images, threads, FINE_PX)
+            model = triangulate_points(model, database, images, threads, FINE_PX)
         model.transform(similarity_between(camera_poses(model)[1], before))
         _, after = camera_poses(model)
         moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=-1)

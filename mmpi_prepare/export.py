@@ -19,7 +19,6 @@ from mmpi_ns.utils.files import whole
 from mmpi_prepare.adjustment import camera_poses
 from mmpi_prepare.images import QUALITY, Photo
 from mmpi_prepare.poses import opencv_intrinsics
-from mmpi_priors.sfm import quiet
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 """Written explicitly: without it, nerfstudio-data assumes an axis swap if colmap/sparse/0 exists."""
@@ -182,7 +181,7 @@ def undistort(
     (target / "bent").mkdir(parents=True)
     model.write(target / "bent")
     names = [photo.name for photo in photos]
-    with progress("Undistorting", 1) as advance, quiet():
+    with progress("Undistorting", 1) as advance:
         pycolmap.undistort_images(
             target, target / "bent", images, image_names=names, jpeg_quality=QUALITY, num_threads=threads
         )

@@ -22,7 +22,7 @@ from scipy.cluster.vq import kmeans2, vq
 from mmpi_ns.utils.errors import InputError, progress
 from mmpi_ns.utils.files import whole
 from mmpi_prepare.images import Photo
-from mmpi_priors.sfm import MIN_INLIERS, count_features, find_features, new_model, quiet, write_images
+from mmpi_priors.sfm import MIN_INLIERS, count_features, find_features, new_model, write_images
 
 DATABASE = "database.db"
 """Name of a database in its folder."""
@@ -79,21 +79,20 @@ def extract(
     options.num_threads, options.max_image_size = threads, LARGEST_SIDE
     most = max(p.width * p.height for p in photos) // PIXELS_A_FEATURE
     options.sift.max_num_features = min(max_features, max(most, LEAST_FEATURES))
-    with quiet():
-        is_poor = most < LEAST_FEATURES
-        if not is_poor:
-            sample = database.with_name("sample.db")
-            sample.unlink(missing_ok=True)
-            places = sorted({round(i) for i in np.linspace(0, len(names) - 1, SAMPLE)})
-            find_features(sample, images, [names[i] for i in places], options, masks)
-            is_poor = float(np.median([n or 0 for n in count_features(sample)])) < 0.5 * options.sift.max_num_features
-            sample.unlink()
-        if is_poor:
-            options.sift.peak_threshold = FAINT
-        with progress("Finding features", len(names)) as advance:
-            for start in range(0, len(names), BATCH):
-                find_features(database, images, names[start : start + BATCH], options, masks)
-                advance(len(names[start : start + BATCH]))
+    is_poor = most < LEAST_FEATURES
+    if not is_poor:
+        sample = database.with_name("sample.db")
+        sample.unlink(missing_ok=True)
+        places = sorted({round(i) for i in np.linspace(0, len(names) - 1, SAMPLE)})
+        find_features(sample, images, [names[i] for i in places], options, masks)
+        is_poor = float(np.median([n or 0 for n in count_features(sample)])) < 0.5 * options.sift.max_num_features
+        sample.unlink()
+    if is_poor:
+        options.sift.peak_threshold = FAINT
+    with progress("Finding features", len(names)) as advance:
+        for start in range(0, len(names), BATCH):
+            find_features(database, images, names[start : start + BATCH], options, masks)
+            advance(len(names[start : start + BATCH]))
     counts = count_features(database)
     if None in counts:
         raise InputError(f"{names[counts.index(None)]} cannot be read by COLMAP: repair or remove it.")

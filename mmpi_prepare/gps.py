@@ -70,7 +70,7 @@ def in_metres(places: Array) -> Array:
     return np.stack([east * across * np.sqrt(1 - sine**2), north * along, places[:, 2] - middle[2]], -1)
 
 
-def aligned(source: Array, target: Array, kept: Array) -> tuple[float, Array, Array]:
+def aligned(source: Array, target: Array, kept: NDArray[np.integer]) -> tuple[float, Array, Array]:
     """The similarity by least squares from the ``kept`` points to others, [N, D] each: its scale, its rotation [D, D],
     and the error of each point [N].
 
@@ -115,22 +115,21 @@ def find_fit(poses: Array, places: Sequence[Place | None]) -> Fit | None:
     if count < LEAST or len(noted) < SHARE * len(poses):
         say(f"GPS of {len(noted)} photos at {count} places is too little for metres.")
         return None
-    up, what = None, "Metres"
+    level, _ = level_up(poses[:, :3, 0], -poses[:, :3, 1])
+    plane = np.linalg.svd(level[None])[2][1:]  # two axes across up, as east and north are
+    plane[1] *= np.sign(np.cross(*plane) @ level)
+    up, what, (scale, _, errors) = None, "Metres", robustly(centers @ plane.T, metres[:, :2])
     if np.isfinite(metres).all():
-        scale, rotation, errors = robustly(centers, metres)
-        across = scale * np.linalg.svd(centers - centers.mean(0), compute_uv=False)[1] / np.sqrt(len(noted))
-        up, what = (rotation[2], "Metres and up") if np.median(errors) <= LEVEL * across else (None, what)
-    if up is None:
-        level, _ = level_up(poses[:, :3, 0], -poses[:, :3, 1])
-        plane = np.linalg.svd(level[None])[2][1:]  # two axes across up, as east and north are
-        plane[1] *= np.sign(np.cross(*plane) @ level)
-        scale, _, errors = robustly(centers @ plane.T, metres[:, :2])
+        whole = robustly(centers, metres)
+        across = whole[0] * np.linalg.svd(centers - centers.mean(0), compute_uv=False)[1] / np.sqrt(len(noted))
+        if np.median(whole[2]) <= LEVEL * across:
+            up, what, (scale, _, errors) = whole[1][2], "Metres and up", whole
     error = float(np.median(errors))
     extent = scale * float(np.ptp(centers @ np.linalg.svd(centers - centers.mean(0))[2][0]))
     if error > AGREES * extent:
         say(f"Metres are not known: GPS of {len(noted)} photos differs by {error:.1f} m from a path of {extent:.0f}.")
         return None
-    kept = int((errors <= OFF * max(error, 1e-9)).sum())
+    kept = np.count_nonzero(errors <= OFF * max(error, 1e-9))
     number = f"{kept}" if kept == len(noted) else f"{kept} of {len(noted)}"
     says = f"GPS of {number} photos: they agree to {error:.1f} m of {extent:.0f}"
     say(f"{what} from {says}.")

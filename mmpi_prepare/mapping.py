@@ -26,7 +26,7 @@ from mmpi_prepare.adjustment import STILL, is_bent, open_focals, polish, quality
 from mmpi_prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_prepare.features import matching_pairs
 from mmpi_prepare.verdict import NEARLY_ALL, ORDER, Verdict, best_first, judge_alone, judge_together
-from mmpi_priors.sfm import MIN_ANGLE, MIN_INLIERS, SEED, quiet
+from mmpi_priors.sfm import MIN_ANGLE, MIN_INLIERS, SEED
 
 ENOUGH, CARRIES = 0.95, 0.5
 """Fraction of registered images at which no further attempt is made, and from which a model is continued with looser
@@ -169,7 +169,7 @@ def _run(
         before = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
         if before:
             say(f"Mapping, {attempt.name}: goes on from {before} images.")
-        with progress(f"Mapping, {attempt.name}", total) as advance, quiet():
+        with progress(f"Mapping, {attempt.name}", total) as advance:
             advance(before)
             models = pycolmap.incremental_mapping(
                 database,
@@ -245,12 +245,11 @@ def map_globally(
         mapper.track_required_tracks_per_view = TRACKS_PER_VIEW
         mapper.min_tri_angle_deg, mapper.skip_retriangulation = MIN_ANGLE, True
         mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = refine
-        with quiet():
-            models = pycolmap.global_mapping(database, task.images, folders, options)
-            for number, model in models.items():
-                (folders / str(number)).mkdir(exist_ok=True)
-                full = with_all_points(model, database, task.images, refine, threads, PLACED_ROUNDS)
-                full.write(folders / str(number))
+        models = pycolmap.global_mapping(database, task.images, folders, options)
+        for number, model in models.items():
+            (folders / str(number)).mkdir(exist_ok=True)
+            full = with_all_points(model, database, task.images, refine, threads, PLACED_ROUNDS)
+            full.write(folders / str(number))
         (folder / "done").touch()
     largest = largest_model(folders)
     return largest and largest[0]
@@ -347,8 +346,7 @@ def _starts(task: Task) -> dict[str, dict[int, float]]:
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed = SEED
     options.reestimate_relative_pose = False  # only the focal lengths are taken
-    with quiet():
-        pycolmap.calibrate_view_graph(calibrated_database, options)
+    pycolmap.calibrate_view_graph(calibrated_database, options)
     with pycolmap.Database.open(calibrated_database) as opened:
         calibrated = {c.camera_id: c.mean_focal_length() for c in opened.read_all_cameras()}
     calibrated_database.unlink()
@@ -377,7 +375,6 @@ def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[st
     workers, models = min(cores, len(starts)), []
     with (
         progress("Global mapping", len(starts)) as advance,
-        quiet(),  # outermost: each mapper's own would end before the other is done
         ThreadPoolExecutor(workers) as pool,
     ):
         for model in pool.map(lambda s: map_globally(task, s[0], s[1], names, max(1, cores // workers)), starts):

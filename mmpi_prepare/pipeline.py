@@ -177,7 +177,7 @@ class Preparation:
         else:
             alike = features.image_similarity(database, len(names))
             pairs, says = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
-        with progress("Matching pairs", len(pairs)) as advance, quiet():
+        with progress("Matching pairs", len(pairs)) as advance:
             for start in range(0, len(pairs), features.PAIR_BATCH):  # but for those matched before
                 batch = [(names[i], names[j]) for i, j in pairs[start : start + features.PAIR_BATCH]]
                 match_pairs(database, batch, threads=s.threads)
