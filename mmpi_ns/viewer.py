@@ -114,6 +114,7 @@ class PathControls(ViewerElement[float], ViewerControl):
         super()._setup(viewer)
         cameras: Cameras = viewer.pipeline.datamanager.train_dataset.cameras  # type: ignore[union-attr]
         self._path = CapturedPath(cameras.camera_to_worlds.cpu().numpy())
+        self._slider.value = round(self._path.start / max(len(self._path) - 1, 1), 3)
         camera = cameras[self._path.start]
         self._half_width = float(min(camera.cx, camera.width - camera.cx) / camera.fx)
         self._half_height = float(min(camera.cy, camera.height - camera.cy) / camera.fy)
@@ -175,10 +176,10 @@ class PathControls(ViewerElement[float], ViewerControl):
         """Walks on until Play is off, the window is closed, or the path ends."""
         assert self._path is not None
         step = CAMERAS_PER_SECOND / FRAMES_PER_SECOND / max(len(self._path) - 1, 1)
-        if self._slider.value >= 1:
-            self._slider.value = 0.0
-        while self._play.value and client.client_id in self.viser_server.get_clients() and self._slider.value < 1:
-            self._slider.value = min(self._slider.value + step, 1.0)
+        place = self._slider.value if self._slider.value < 1 else 0.0
+        while self._play.value and client.client_id in self.viser_server.get_clients() and place < 1:
+            place = min(place + step, 1.0)
+            self._slider.value = place
             time.sleep(1 / FRAMES_PER_SECOND)
         self._walker = None
         self._play.value = False
