@@ -52,6 +52,7 @@ from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import Generators
+from mmpi_ns.viewer import PathControls
 
 
 @dataclass
@@ -138,6 +139,7 @@ class MMPIModel(Model):
         """``Schedule.decay`` of the step."""
         self.decay: Tensor
         self.show = ViewerDropdown("Show MPI", "all", ["all"], hint="One MPI alone, or all")
+        self.path_controls = PathControls()
         self._take_plan()
         dispatch.choose(config.ops)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
@@ -285,7 +287,10 @@ class MMPIModel(Model):
             raise InputError(f"An image of {width} x {height} pixels shows nothing: give a smaller --downscale-factor.")
         if obb_box is not None:
             return super().get_outputs_for_camera(camera, obb_box)
-        return self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))
+        outputs = self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))
+        if current_thread() is not main_thread():  # the viewer's
+            self.path_controls.note(float((outputs["accumulation"] > 0.5).float().mean()))
+        return outputs
 
     @torch.no_grad()
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
