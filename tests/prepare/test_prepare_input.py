@@ -418,8 +418,9 @@ def test_a_blurred_frame_is_found_and_the_plain_end_of_a_pan_is_not_called_blurr
 def test_numbers_in_names_are_an_order_only_where_the_matches_support_it(tmp_path):
     names = [f"{i:02d}.png" for i in range(25)]
     shuffled = np.random.default_rng(0).permutation(25)
-    for order, is_ordered in ((np.arange(25), True), (shuffled, False)):
-        database = tmp_path / f"{is_ordered}.db"
+    in_parts = np.arange(25).reshape(-1, 5)[[2, 0, 4, 1, 3]][:, [1, 3, 0, 4, 2]].ravel()
+    for order, is_ordered in ((np.arange(25), True), (shuffled, False), (in_parts, False)):
+        database = tmp_path / f"{order[0]}-{is_ordered}.db"
         with pycolmap.Database.open(database) as opened:
             camera = opened.write_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=4, height=4, params=[4, 2, 2]))
             for name in names:
