@@ -155,7 +155,7 @@ def exact_colors(model: MMPIModel, images: list[Image], rays: list[Array]) -> Ar
         bundle = camera.generate_rays(camera_indices=0, keep_shape=True)[tuple(torch.from_numpy(pixels).T)]
         rays64 = in_float64(bounded(bundle, field.plan))
         for part in (rays64[i : i + EXACT_RAYS] for i in range(0, len(rays64), EXACT_RAYS)):
-            found = render_plainly(field, part, blends=model.blends(field))
+            found = render_plainly(field, part, blends=field.blends)
             behind = found.composite.transmittance * BACKGROUNDS[model.config.rendering.background]
             colors.append((found.rgb + behind).clamp(0, 1).numpy())
     return np.concatenate(colors)

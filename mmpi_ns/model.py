@@ -176,6 +176,7 @@ class MMPIModel(Model):
         return MMPIField(
             self.progress.windows.plans[0],
             shares_depth=schedule.is_joint,
+            learns_reliability=self.config.schedule.training != "joint",
             factor=schedule.texel_factor(0),
             views=views,
             **asdict(self.config.colour),
@@ -215,7 +216,7 @@ class MMPIModel(Model):
                 head_mask = torch.arange(field.plan.num_heads, device=self.device) == heads[:, None]
                 head_mask[:, num_mpis:].fill_(True)
                 bundle = bundle.broadcast_to((num_mpis, asked)).flatten()
-        blends = "reliability" in TRAINS[phase] and self.blends(field)
+        blends = "reliability" in TRAINS[phase] and field.blends
         options = self.config.sampling.options(field.plan, not progress.schedule.sharpened(progress.step), blends)
         options = options._replace(capacity=self.capacity)
         rays = render_rays(bundle, field, options, head_mask, choose)
@@ -250,7 +251,7 @@ class MMPIModel(Model):
         first_head = sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         bundle = bounded(bundle, field.plan)
-        blends, head_mask = self.blends(field), None
+        blends, head_mask = field.blends, None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
             heads = field.planned_heads(torch.arange(field.plan.num_heads, device=self.device))
@@ -265,10 +266,6 @@ class MMPIModel(Model):
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1)}
         radiance = outputs["rgb"] + behind / exposure
         return outputs | {"rgb": (exposure * radiance).clamp(0, 1), "radiance": radiance}
-
-    def blends(self, field: MMPIField) -> bool:
-        """Whether reliability enters a field's pictures."""
-        return self.config.schedule.training != "joint" and field.plan.num_heads > 1
 
     # Images ------------------------------------------------------------------------------------------------------
 

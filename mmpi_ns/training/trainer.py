@@ -242,7 +242,7 @@ class MMPITrainer(Trainer):
         g = generator(model.config.seed, progress.step, "agreement", self.device)
         bundle, _ = sources.draw(AGREEMENT_RAYS, g)
         forming = not progress.schedule.sharpened(progress.step)
-        options = model.config.sampling.options(field.plan, forming, model.blends(field))
+        options = model.config.sampling.options(field.plan, forming, field.blends)
         return disagreement(field, bounded(bundle, field.plan), options)
 
     def train_iteration(self, step: int) -> Any:
