@@ -95,9 +95,8 @@ class MMPIField(TexelTables):
         self.samples_per_voxel = samples_per_voxel
         self.cube_alpha = cube_alpha
         self.learns_reliability = learns_reliability
-        self.learns_cover = True
-        """Whether training rays mark the texels they train. Only blending needs the marks; once it has begun none are
-        added, so that P cannot jump."""
+        self.marks_texels = True
+        """Whether training rays mark the texels that they read (``training/reliability.py``)."""
         self.shading = shading
         sizes = (feature_channels, hidden_width)
         if shading == "ray":
@@ -221,7 +220,7 @@ class MMPIField(TexelTables):
         A density times an interval: on a plane there is no interval, so the product itself is learned.
         """
         lookup = self._lookup(rays, samples)
-        if self.training and self.learns_cover:
+        if self.training and self.marks_texels:
             self.touched.index_fill_(0, lookup.rows, 1)
             self.touched[:BRICK].zero_()
         raw = lookup.by_head(lookup.read(lookup.density)[:, 0])

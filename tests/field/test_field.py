@@ -191,7 +191,7 @@ def test_gradients_are_those_of_the_rows_of_the_batch(plan):
 @pytest.mark.parametrize("case", ["blending", "evaluating"])
 def test_texels_count_as_trained_only_before_blending_and_in_training(plan, case):
     field = fill(MMPIField(plan), seed=5).train(case != "evaluating")
-    field.learns_cover = case != "blending"
+    field.marks_texels = case != "blending"
     field.touched.fill_(0)
     field.optical_depths(*sampled(field, bundle(*random_rays(plan, 3, seed=2))))
     assert field.touched.sum() == 0
