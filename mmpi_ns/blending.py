@@ -7,11 +7,13 @@ it (``blend_shares``), and the sample's optical depth once its alpha is multipli
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.heads import heads_of
+from mmpi_ns.heads import CubeHead, MPIHead, heads_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout
@@ -113,3 +115,23 @@ def log_shares(
     each = zip(values.split([len(i) for i in chosen]), chosen, strict=True)
     columns = [value.new_zeros(len(heads)).index_copy(0, index, value) for value, index in each]
     return blend_shares(torch.stack(columns, -1), torch.stack(cover, -1), heads)
+
+
+def head_shares(
+    heads: Sequence[MPIHead | CubeHead],
+    places: Sequence[tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]],
+    reliability: Float[Tensor, "T 1"],
+    touched: Tensor,
+) -> Float[Tensor, "N H"]:
+    """P of every head at points; 0 where a head does not cover one, and all 0 where none does.
+
+    Args:
+        heads: of the scene.
+        places: the points' NDC in each head, and whether they lie inside of it (``place_points``).
+        reliability: R of all texels.
+        touched: for every row [T]: 1 if a training ray read it.
+    """
+    covers = torch.stack([head.covers(touched, *place) for head, place in zip(heads, places, strict=True)], -1)
+    values = [head.values(reliability, ndc)[:, 0] for head, (ndc, _) in zip(heads, places, strict=True)]
+    values = torch.stack(values, -1).masked_fill(~covers, torch.finfo(reliability.dtype).min)
+    return torch.where(covers, torch.softmax(values, -1), 0.0)

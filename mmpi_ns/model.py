@@ -47,7 +47,8 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import last_checkpoint
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
-from mmpi_ns.training.phases import TRAINS, ScheduleConfig, make_schedule
+from mmpi_ns.training.phases import ScheduleConfig, make_schedule
+from mmpi_ns.training.reliability import assign_heads, blends_in
 from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
@@ -178,6 +179,7 @@ class MMPIModel(Model):
         return MMPIField(
             self.progress.windows.plans[0],
             shares_depth=schedule.is_joint,
+            learns_reliability=self.config.schedule.training != "joint",
             factor=schedule.texel_factor(0),
             views=views,
             **asdict(self.config.colour),
@@ -203,21 +205,11 @@ class MMPIModel(Model):
         if not self.training:
             return self.image_outputs(ray_bundle)
         progress, field, bundle, asked = self.progress, self.field, ray_bundle, len(ray_bundle)
-        phase, head_mask, choose = progress.schedule.phase_at(progress.step).name, None, None
-        num_mpis = len(field.plan.mpis)
+        phase = progress.schedule.phase_at(progress.step).name
         move_rays(bundle, self.camera_optimizer)
-        bundle = bounded(bundle, field.plan)
-        if phase == "individual" and num_mpis > 1:
-            # Rays for one of the MPIs that they meet, or for every MPI in turn, and for the cube (paper sec. III-C).
-            if self.config.schedule.rays_per_mpi == "split":
-                g = self.draws.of(progress.step, "assignment")
-                choose = torch.rand(asked, num_mpis, generator=g, device=self.device)
-            else:
-                heads = torch.arange(num_mpis, device=self.device).repeat_interleave(asked)
-                head_mask = torch.arange(field.plan.num_heads, device=self.device) == heads[:, None]
-                head_mask[:, num_mpis:].fill_(True)
-                bundle = bundle.broadcast_to((num_mpis, asked)).flatten()
-        blends = "reliability" in TRAINS[phase] and self.blends(field)
+        drawn = self.config.schedule.rays_per_mpi, self.draws, progress.step
+        bundle, head_mask, choose = assign_heads(bounded(bundle, field.plan), field.plan, phase, *drawn)
+        blends = blends_in(phase, field)
         options = self.config.sampling.options(field.plan, not progress.schedule.sharpened(progress.step), blends)
         options = options._replace(capacity=self.capacity)
         rays = render_rays(bundle, field, options, head_mask, choose)
@@ -252,7 +244,7 @@ class MMPIModel(Model):
         first_head = sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         bundle = bounded(bundle, field.plan)
-        blends, head_mask = self.blends(field), None
+        blends, head_mask = field.blends, None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
             heads = field.planned_heads(torch.arange(field.plan.num_heads, device=self.device))
@@ -267,10 +259,6 @@ class MMPIModel(Model):
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1)}
         radiance = outputs["rgb"] + behind / exposure
         return outputs | {"rgb": (exposure * radiance).clamp(0, 1), "radiance": radiance}
-
-    def blends(self, field: MMPIField) -> bool:
-        """Whether reliability enters a field's pictures."""
-        return self.config.schedule.training != "joint" and field.plan.num_heads > 1
 
     # Images ------------------------------------------------------------------------------------------------------
 

@@ -51,7 +51,7 @@ def bake_of_model(model: MMPIModel, field: MMPIField) -> BakedWindow:
     """A window of a model, as its images show it. Raises ValueError if it cannot be baked (says why)."""
     rendering, mean = model.config.rendering, model.exposures.mean
     exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
-    return bake(field, rendering.threshold, BACKGROUNDS[rendering.background], model.blends(field), exposure)
+    return bake(field, rendering.threshold, BACKGROUNDS[rendering.background], field.blends, exposure)
 
 
 @torch_apart()

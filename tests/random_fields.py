@@ -81,12 +81,12 @@ def sampled(field, rays, threshold=0.0, blends=False, fair_share=math.inf, head_
 def render(field, rays, threshold=0.0, blends=False, **chosen):
     """March, field and compositing, put together as the model does."""
     _, samples = sampled(field, rays, threshold, blends, **chosen)
-    tau, lookup = field.get_density(rays, samples)
+    tau, lookup = field.optical_depths(rays, samples)
     if blends and lookup.index.numel():
         flat = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(rays, samples, lookup))
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
     composite = composite_weights.reference(tau, samples.valid, samples.skipped_before, samples.skipped_total)
-    return Rendered(samples, composite, render_colors(composite, field.get_outputs(rays, samples, lookup)))
+    return Rendered(samples, composite, render_colors(composite, field.sample_colors(rays, samples, lookup)))
 
 
 # The same by loops in float64 -----------------------------------------------------------------------------------------

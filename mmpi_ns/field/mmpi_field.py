@@ -12,15 +12,17 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
-from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
-from mmpi_ns.blending import log_shares
+from mmpi_ns.blending import head_shares, log_shares
 from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
 from mmpi_ns.field.tables import Lookup, TexelTables
+from mmpi_ns.heads import heads_of
 from mmpi_ns.ops.composite import Composite, render_colors
 from mmpi_ns.ops.dispatch import on_gpu
-from mmpi_ns.ops.gather import RaySums, Taps, gather_places, gather_taps
+from mmpi_ns.ops.gather import RaySums, Taps, activate, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MergedSamples
@@ -65,6 +67,7 @@ class MMPIField(TexelTables):
         position_frequencies: octaves of the positional encoding of NDC positions, where samples are shaded.
         direction_frequencies: octaves of the positional encoding of directions.
         shares_depth: K MPIs train jointly from the start, so each has 1/K of the optical depth.
+        learns_reliability: training has a phase of reliability (``training/reliability.py``).
         samples_per_voxel: samples along a ray per voxel side of the cube.
         cube_alpha: initial alpha of a cube sample.
         factor: texels in use, as a share of the plan's.
@@ -81,6 +84,7 @@ class MMPIField(TexelTables):
         position_frequencies: int = POSITION_FREQUENCIES,
         direction_frequencies: int = DIRECTION_FREQUENCIES,
         shares_depth: bool = False,
+        learns_reliability: bool = False,
         samples_per_voxel: float = 1.0,
         cube_alpha: float = 1e-3,
         factor: float = 1.0,
@@ -90,9 +94,9 @@ class MMPIField(TexelTables):
         self.shares_depth = shares_depth
         self.samples_per_voxel = samples_per_voxel
         self.cube_alpha = cube_alpha
-        self.learns_cover = True
-        """Whether training rays mark the texels they train. Only blending needs the marks; once it has begun none are
-        added, so that P cannot jump."""
+        self.learns_reliability = learns_reliability
+        self.marks_texels = True
+        """Whether training rays mark the texels that they read (``training/reliability.py``)."""
         self.shading = shading
         sizes = (feature_channels, hidden_width)
         if shading == "ray":
@@ -141,21 +145,82 @@ class MMPIField(TexelTables):
         return Tables(self.density.data, self.reliability.data, self.touched)
 
     @property
+    def blends(self) -> bool:
+        """Whether heads are blended by reliability where several cover a point. One has nothing to blend with."""
+        return self.learns_reliability and self.plan.num_heads > 1
+
+    @property
     def nbytes(self) -> int:
         """Bytes of its tables."""
         return sum(x.nbytes for x in self.state_dict().values())
 
     # nerfstudio's Field ------------------------------------------------------------------------------------------
 
-    def get_density(  # type: ignore[override]
-        self, rays: RayBundle, samples: MergedSamples
-    ) -> tuple[Float[Tensor, "R S"], Lookup]:
+    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch C"]]:
+        """Densities, and mean colours and features, at the positions of any samples.
+
+        A plane has an optical depth and no thickness. A density is that depth over the distance to the next plane along
+        the head's axis (``MPIHead.density``), so its integral through a head in that direction is the optical depth
+        that the head's planes have there. Heads that cover a point add up, each by its share: alpha becomes P alpha
+        (paper sec. III-C), and in the limit of thin samples tau becomes P tau. Without reliability all shares are 1, as
+        in rendering.
+
+        Args:
+            ray_samples: whose ``frustums.get_positions()`` are asked for, world axes.
+
+        Returns:
+            1 / scene units, 0 where no head is; and what the texels hold there, weighted by the density of each head,
+            0 where there is none.
+        """
+        positions = ray_samples.frustums.get_positions()
+        points, heads = positions.reshape(-1, 3), heads_of(self.layout)
+        places = [head.place_points(points) for head in heads]
+        if self.blends:
+            shares = head_shares(heads, places, self.reliability, self.touched)
+        else:
+            shares = torch.stack([inside for _, inside in places], -1).to(points.dtype)
+        densities, embedding = points.new_zeros(len(points)), points.new_zeros(len(points), self.features.shape[1])
+        for head, (ndc, _), share in zip(heads, places, shares.unbind(-1), strict=True):
+            index = (share > 0).nonzero()[:, 0]
+            density = share[index] * head.density(self.density, points[index], ndc[index])
+            densities = densities.index_add(0, index, density)
+            values = head.values(self.features, ndc[index])
+            if self.shading == "ray":  # a sample's colour is composited, not its logits
+                values = activate(values)
+            embedding = embedding.index_add(0, index, density[:, None] * values)
+        embedding = embedding / densities.clamp(min=torch.finfo(densities.dtype).tiny)[:, None]
+        return densities.view(*positions.shape[:-1], 1), embedding.view(*positions.shape[:-1], -1)
+
+    def get_outputs(
+        self, ray_samples: RaySamples, density_embedding: Float[Tensor, "*batch C"] | None = None
+    ) -> dict[FieldHeadNames, Float[Tensor, "*batch 3"]]:
+        """Colours at the positions of any samples, of the texels that ``get_density`` reads there.
+
+        A network for every sample has a view of its own in each head; here the texels' diffuse colour answers.
+
+        Args:
+            ray_samples: positions and directions, world axes.
+            density_embedding: colours and features there; None: those of ``get_density``.
+        """
+        if density_embedding is None:
+            density_embedding = self.get_density(ray_samples)[1]
+        values = density_embedding.reshape(-1, density_embedding.shape[-1])
+        if isinstance(self.networks, RayShader):
+            one = torch.ones_like(values[:, :1])
+            colors = self.networks.shade(values, one, one, ray_samples.frustums.directions.reshape(-1, 3))
+        else:
+            colors = torch.sigmoid(values[:, :3])
+        return {FieldHeadNames.RGB: colors.view(*density_embedding.shape[:-1], 3)}
+
+    # Merged samples ----------------------------------------------------------------------------------------------
+
+    def optical_depths(self, rays: RayBundle, samples: MergedSamples) -> tuple[Float[Tensor, "R S"], Lookup]:
         """Optical depth of each valid sample (0 in empty slots), and where the lookups went.
 
-        nerfstudio's "density" times interval: on a plane there is no interval, so the product itself is learned.
+        A density times an interval: on a plane there is no interval, so the product itself is learned.
         """
         lookup = self._lookup(rays, samples)
-        if self.training and self.learns_cover:
+        if self.training and self.marks_texels:
             self.touched.index_fill_(0, lookup.rows, 1)
             self.touched[:BRICK].zero_()
         raw = lookup.by_head(lookup.read(lookup.density)[:, 0])
@@ -191,7 +256,7 @@ class MMPIField(TexelTables):
         read = (distinct.unique, *(read_rows(table, distinct.unique) for table in (self.density, self.features)))
         return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read, distinct=distinct.count)
 
-    def get_outputs(  # type: ignore[override]
+    def sample_colors(
         self,
         rays: RayBundle,
         samples: MergedSamples,
@@ -246,7 +311,7 @@ class MMPIField(TexelTables):
             chosen: rays whose colours are needed; others may be left out to save time. None for all.
         """
         if not isinstance(self.networks, RayShader):
-            colors, weights = self.get_outputs(rays, samples, lookup, chosen), composite.weights.detach()[..., None]
+            colors, weights = self.sample_colors(rays, samples, lookup, chosen), composite.weights.detach()[..., None]
             rgb, first = render_colors(composite, colors), (weights * colors).sum(1)
             return rgb, RaySums(first, weights.sum(1), first, (weights * colors**2).sum(1))
         if lookup is None:

@@ -127,7 +127,7 @@ def render_rays(
         samples = march(field.layout, field.tables, rays_of(bundle, head_mask, choose), options)
     tau, lookup = samples.tau, None
     if torch.is_grad_enabled():
-        tau, lookup = field.get_density(bundle, samples)
+        tau, lookup = field.optical_depths(bundle, samples)
         if options.blends and lookup.index.numel():
             shares = field.sample_shares(bundle, samples, lookup)
             blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares)

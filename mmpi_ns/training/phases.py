@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from itertools import accumulate, pairwise
 from typing import Literal
 
+from mmpi_ns.training.reliability import TRAINS, phase_lengths
 from mmpi_ns.utils.errors import InputError
 
 SOONER = 4
@@ -20,13 +21,6 @@ GROWING_SHARE, FULL_STEPS = 0.5, 1250
 of at most so many steps draw all, those in between as many in all as these (docs/ablations.md)."""
 COPIES_FROM = 0.75
 """Share of the time of high rates after which MPIs may get finer copies."""
-TRAINS: dict[str, frozenset[str]] = {
-    "individual": frozenset({"density", "features", "colour", "camera_opt"}),
-    "joint": frozenset({"density", "features", "colour", "camera_opt"}),
-    "blend": frozenset({"reliability"}),
-    "finetune": frozenset({"density", "features", "colour", "reliability", "camera_opt"}),
-}
-"""Trainable kinds of parameters of each phase; everything else is frozen bit for bit."""
 
 
 @dataclass
@@ -184,10 +178,8 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, de
         raise InputError(f"Training needs at least 1 step, got {total_steps}: raise --max-num-iterations.")
     check_schedule(config)
     lengths = {"joint": total_steps}
-    if config.training == "two-phase":  # the first phase has a step, even if rounding up the others would take them all
-        blend = min(round(total_steps * config.blend_share), total_steps - 1)
-        finetune = min(round(total_steps * config.finetune_share), total_steps - 1 - blend)
-        lengths = {"individual": total_steps - blend - finetune, "blend": blend, "finetune": finetune}
+    if config.training == "two-phase":
+        lengths = phase_lengths(total_steps, config.blend_share, config.finetune_share)
     ends = accumulate(lengths.values())
     phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)
     first = phases[0].end

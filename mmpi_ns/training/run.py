@@ -24,7 +24,8 @@ from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training.initial import start_from_depths
-from mmpi_ns.training.phases import TRAINS, Schedule
+from mmpi_ns.training.phases import Schedule
+from mmpi_ns.training.reliability import TRAINS, prepare_parameters
 from mmpi_ns.training.storage import prepare_storage
 from mmpi_ns.utils.files import to_bytes, to_text
 
@@ -134,7 +135,7 @@ class TrainingRun:
     _drawn_from: int | None = None
 
     def parameters(self) -> dict[str, list[Parameter]]:
-        """Parameters by kind (``phases.TRAINS``); each kind has its own learning rate."""
+        """Parameters by kind (``reliability.TRAINS``); each kind has its own learning rate."""
         field = self.field
         groups = {
             "density": [field.density],
@@ -177,8 +178,6 @@ class TrainingRun:
                 if step == window * schedule.window_steps and manager.sources is not None:
                     start_from_depths(field, manager.sources, manager.config.seed)
         phase = schedule.phase_at(step).name
-        field.learns_cover = phase == "individual"
-        for kind, params in groups.items():
-            params[0].requires_grad_(kind in TRAINS[phase])
+        prepare_parameters(field, groups, phase)
         if "camera_opt" in TRAINS[phase] and self.poses and self.views is not None:
             keep_frame(self.poses[0], self.views.origins, field.plan.content_near, self.scale_is_free)

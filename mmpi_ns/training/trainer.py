@@ -150,7 +150,7 @@ class MMPITrainer(Trainer):
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
         run, manager, windows = self._run, self._manager, plan.windows
-        work = Work(run.field.feature_channels, any(phase.name == "blend" for phase in run.progress.schedule.phases))
+        work = Work(run.field.feature_channels, not run.progress.schedule.is_joint)
         tables = [training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows]
         cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
         say(manager.describe())
@@ -242,7 +242,7 @@ class MMPITrainer(Trainer):
         g = generator(model.config.seed, progress.step, "agreement", self.device)
         bundle, _ = sources.draw(AGREEMENT_RAYS, g)
         forming = not progress.schedule.sharpened(progress.step)
-        options = model.config.sampling.options(field.plan, forming, model.blends(field))
+        options = model.config.sampling.options(field.plan, forming, field.blends)
         return disagreement(field, bounded(bundle, field.plan), options)
 
     def train_iteration(self, step: int) -> Any:

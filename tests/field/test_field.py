@@ -168,8 +168,8 @@ def test_a_head_votes_inside_its_frustum_where_it_was_trained_and_a_sample_count
 def trained_once(field, rays):
     field.train()
     samples = sampled(field, rays)
-    tau, lookup = field.get_density(*samples)
-    rgb = field.get_outputs(*samples, lookup)
+    tau, lookup = field.optical_depths(*samples)
+    rgb = field.sample_colors(*samples, lookup)
     (tau.sum() + (rgb * tau.detach()[..., None]).sum()).backward()
     return samples, lookup
 
@@ -191,9 +191,9 @@ def test_gradients_are_those_of_the_rows_of_the_batch(plan):
 @pytest.mark.parametrize("case", ["blending", "evaluating"])
 def test_texels_count_as_trained_only_before_blending_and_in_training(plan, case):
     field = fill(MMPIField(plan), seed=5).train(case != "evaluating")
-    field.learns_cover = case != "blending"
+    field.marks_texels = case != "blending"
     field.touched.fill_(0)
-    field.get_density(*sampled(field, bundle(*random_rays(plan, 3, seed=2))))
+    field.optical_depths(*sampled(field, bundle(*random_rays(plan, 3, seed=2))))
     assert field.touched.sum() == 0
 
 
@@ -201,7 +201,7 @@ def test_reliability_learns_where_heads_overlap(plan):
     field = fill(MMPIField(plan), seed=6)
     rays = bundle(np.zeros((2, 3)), [[0, 0, 1], [0.7, 0.2, 0.7]])
     samples = sampled(field, rays)
-    _, lookup = field.get_density(*samples)
+    _, lookup = field.optical_depths(*samples)
     log_p, _ = field.sample_shares(*samples, lookup)
     log_p[lookup.heads == 0].sum().backward()
     grad = dense_grad(field.reliability)
@@ -216,7 +216,7 @@ def test_total_variation_is_the_sum_over_touched_texels_and_their_neighbours(wit
     cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (3, 2, 4)) if with_cube else None
     field = fill(MMPIField(ScenePlan(mpis, cube, 0.05, 1.0), feature_channels=4), seed=7, log_depths=(-2, 0.5))
     samples = sampled(field, bundle([[0, 0, 0]], [[-0.4, -0.15, 0.9]]))
-    _, lookup = field.get_density(*samples)
+    _, lookup = field.optical_depths(*samples)
     touched = {row for taps in lookup.taps for row in lookup.rows[taps.positions].reshape(-1).tolist()}
     wanted, gradient, size = 0.0, np.zeros(len(field.density)), field.plan.texels
     for k, grid in enumerate(field.grids):
@@ -251,7 +251,7 @@ def test_differences_of_chroma_count_more_in_the_gradient_of_features_alone():
     samples, gradients = sampled(field, bundle([[0, 0, 0]], [[-0.4, -0.15, 0.9]])), []
     for times in (0.0, 7.0):
         field.zero_grad(set_to_none=True)
-        _, lookup = field.get_density(*samples)
+        _, lookup = field.optical_depths(*samples)
         lookup.density.retain_grad(), lookup.features.retain_grad()
         (3 * field.total_variation(lookup, 1.0, 1.0, times) + lookup.features.sum()).backward()
         gradients.append((lookup.density.grad, lookup.features.grad.double()))
@@ -266,10 +266,10 @@ def test_differences_of_chroma_count_more_in_the_gradient_of_features_alone():
 
 def test_a_batch_without_samples_has_no_variation_and_no_density(plan):
     field = MMPIField(plan)
-    tau, lookup = field.get_density(*sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]])))
+    tau, lookup = field.optical_depths(*sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]])))
     assert tau.shape == (1, 1) and tau.item() == 0
     assert field.total_variation(lookup, 1.0, 1.0).item() == 0
-    assert field.get_outputs(*sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]]))).abs().sum() == 0
+    assert field.sample_colors(*sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]]))).abs().sum() == 0
 
 
 # State ---------------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def shown(field, rays, gradients=False, chosen=None):
     """What the field's rays show, by the ways of training or of rendering."""
     with torch.set_grad_enabled(gradients):
         _, samples = sampled(field, rays)
-        tau, lookup = field.get_density(rays, samples) if gradients else (samples.tau, None)
+        tau, lookup = field.optical_depths(rays, samples) if gradients else (samples.tau, None)
         made = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
         rgb, sums = field.render_colors(rays, samples, lookup, made, chosen)
         return SimpleNamespace(rgb=rgb, **vars(sums)), made

@@ -392,4 +392,4 @@ def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
         expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
         assert torch.equal(expected, found), name
     assert read.show.options == ["all", *trained.field.full_plan.names]
-    assert read.blends(read.field) == trained.blends(trained.field)
+    assert read.field.blends == trained.field.blends

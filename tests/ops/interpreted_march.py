@@ -218,12 +218,12 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
     def gradients():
         field.zero_grad(set_to_none=True)
         _, samples = sampled(field, rays, 1e-3, blends=True)
-        tau, lookup = field.get_density(rays, samples)
+        tau, lookup = field.optical_depths(rays, samples)
         share = field.sample_shares(rays, samples, lookup)
         flat = blending.blended_optical_depth(tau.reshape(-1)[lookup.index], *share)
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
         made = composite.composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
-        colors = field.get_outputs(rays, samples, lookup)
+        colors = field.sample_colors(rays, samples, lookup)
         loss = (composite.render_colors(made, colors) * upstream).sum() + made.accumulation.sum()
         (loss + 0.1 * field.total_variation(lookup, 1.0, 1.0)).backward()
         return {n: dense_grad(p) if isinstance(p, Table) else p.grad for n, p in params.items()}

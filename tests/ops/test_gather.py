@@ -121,7 +121,7 @@ def test_bits_do_not_depend_on_threads(threads, monkeypatch):
 def test_at_places_sums_are_those_at_their_taps(with_cube):
     field = random_field(3, with_cube, seed=7)
     rays, samples = sampled(field, bundle(*random_rays(field.plan, 60, seed=8)))
-    lookup = field.get_density(rays, samples)[1]
+    lookup = field.optical_depths(rays, samples)[1]
     weights = torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
     places = samples.places
     table, everything = field.features.data, torch.ones(60, dtype=torch.bool)

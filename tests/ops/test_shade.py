@@ -32,7 +32,7 @@ def shaded(channels=9, width=32, octaves=(2, 2)):
 
 def colors(field, samples):
     with torch.no_grad():
-        return field.get_outputs(*samples)
+        return field.sample_colors(*samples)
 
 
 def in_float64(field, samples):
@@ -40,7 +40,7 @@ def in_float64(field, samples):
     field._packed = {}  # made anew in float64
     exact, (rays, merged) = copy.deepcopy(field).double(), copy.deepcopy(samples)
     rays.directions = rays.directions.double()
-    return exact.get_outputs(rays, dataclasses.replace(merged, ndc=merged.ndc.double())).detach()
+    return exact.sample_colors(rays, dataclasses.replace(merged, ndc=merged.ndc.double())).detach()
 
 
 @pytest.mark.parametrize(("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (17, 64, (4, 1))])

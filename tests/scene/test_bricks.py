@@ -129,8 +129,8 @@ def test_colours_without_gradients_equal_those_with():
     field = bricked_field().eval()
     samples = sampled(field, bundle(*random_rays(field.plan, 60, seed=8)))
     with torch.no_grad():
-        fast = field.get_outputs(*samples)
-    plain = field.get_outputs(*samples, field.get_density(*samples)[1])
+        fast = field.sample_colors(*samples)
+    plain = field.sample_colors(*samples, field.optical_depths(*samples)[1])
     assert plain.std() > 0.05 and (fast - plain).abs().max() < 1e-5
 
 
@@ -166,9 +166,9 @@ def train(field, steps=4, blends=False):
     for step in range(steps):
         rays = bundle(*random_rays(field.plan, 60, seed=step))
         samples = sampled(field, rays)
-        tau, lookup = field.get_density(*samples)
+        tau, lookup = field.optical_depths(*samples)
         read += sum(int((lookup.rows[taps.positions] < BRICK).sum()) for taps in lookup.taps)
-        rgb = field.get_outputs(*samples, lookup)
+        rgb = field.sample_colors(*samples, lookup)
         loss = (rgb * torch.tanh(tau)[..., None]).sum() + field.total_variation(lookup, 1.0, 1.0)
         loss = loss + field.sample_shares(*samples, lookup)[0].square().sum()
         optimizer.zero_grad()
@@ -263,7 +263,7 @@ def used(field, rays, least):
     """Notes what rays see, and releases."""
     field.look_afresh()
     _, samples = sampled(field, rays)
-    _, lookup = field.get_density(rays, samples)
+    _, lookup = field.optical_depths(rays, samples)
     weights = render(field, rays).composite.weights
     field.note_use(lookup, weights, samples.live, weights.new_ones(len(weights)))
     return weights, field.release_unused(least)

@@ -92,7 +92,7 @@ def test_a_state_with_copies_comes_back():
 def test_the_gain_of_a_brick_is_what_its_samples_weigh_times_the_errors_of_their_rays():
     field = bricked_field()
     rays, samples = sampled(field, bundle(*random_rays(field.plan, 40, seed=1)))
-    _, lookup = field.get_density(rays, samples)
+    _, lookup = field.optical_depths(rays, samples)
     shape = samples.valid.shape
     weights, errors = torch.rand(shape), torch.rand(shape[0])
     field.look_afresh()

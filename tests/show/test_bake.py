@@ -68,7 +68,7 @@ def outputs(model, how, rays):
 def test_baked_images_are_the_exact_ones(trainer, monkeypatch):
     """The same colours to the error of 8 bits, the same depths and winners nearly everywhere; joint, so not blended."""
     model = filled(trainer)
-    monkeypatch.setattr(model.config.schedule, "training", "joint")
+    monkeypatch.setattr(model.field, "learns_reliability", False)
     rays = bundle_of(model.field.plan)
     exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
     assert set(exact) == set(baked) and all(exact[n].shape == baked[n].shape for n in exact)
@@ -83,7 +83,7 @@ def test_finer_copies_are_baked_and_shown_as_parts_of_their_mpis(trainer, monkey
     model = filled(trainer)
     field, count = model.field, len(model.field.plan.mpis)
     plan, factor = field.full_plan, field.factor
-    monkeypatch.setattr(model.config.schedule, "training", "joint")
+    monkeypatch.setattr(model.field, "learns_reliability", False)
     rays = bundle_of(field.plan)
     chosen = (field.tiles > 0) & (torch.rand(len(field.tiles), generator=torch.Generator().manual_seed(1)) < 0.6)
     field.copy_finely(chosen)
@@ -114,7 +114,7 @@ def test_blending_is_baked_into_the_bricks(trainer, monkeypatch):
     rays = bundle_of(model.field.plan)
     exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
     error = (exact["rgb"] - baked["rgb"]).square().mean()
-    monkeypatch.setattr(model.config.schedule, "training", "joint")
+    monkeypatch.setattr(model.field, "learns_reliability", False)
     unblended = outputs(model, "baked", rays)
     assert error < 1e-3 and error < 0.2 * (exact["rgb"] - unblended["rgb"]).square().mean()
 

@@ -1,0 +1,102 @@
+"""The two-phase training of reliability, from its first step to its last (paper sec. III-C).
+
+``individual``: every MPI learns alone. A ray is rendered by one of the MPIs that it meets, or by each in turn, and by
+the cube (``assign_heads``). Training rays mark the texels that they read: there a head covers what it shows.
+
+``blend``: before its first step, texels that no ray has trained are emptied, so that they have no vote
+(``release_untrained``). Then all heads render each ray, blended by reliability (``mmpi_ns/blending.py``), and only
+reliability trains. No texel is marked any more, so that P cannot jump.
+
+``finetune``: all parameters train together, rendered likewise (ours).
+
+``joint`` training has one phase of that name, in which all heads render each ray, each MPI with 1/K of the optical
+depth, and nothing is blended. A scene of one head has nothing to blend with and trains like this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+from torch.nn import Parameter
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.tables import TexelTables
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.utils.random_draws import Generators
+
+TRAINS: dict[str, frozenset[str]] = {
+    "individual": frozenset({"density", "features", "colour", "camera_opt"}),
+    "joint": frozenset({"density", "features", "colour", "camera_opt"}),
+    "blend": frozenset({"reliability"}),
+    "finetune": frozenset({"density", "features", "colour", "reliability", "camera_opt"}),
+}
+"""Trainable kinds of parameters of each phase; everything else is frozen bit for bit."""
+
+
+def phase_lengths(total_steps: int, blend_share: float, finetune_share: float) -> dict[str, int]:
+    """Steps of the phases in their order. The first has one, even if rounding up the others would take them all."""
+    blend = min(round(total_steps * blend_share), total_steps - 1)
+    finetune = min(round(total_steps * finetune_share), total_steps - 1 - blend)
+    return {"individual": total_steps - blend - finetune, "blend": blend, "finetune": finetune}
+
+
+def prepare_parameters(field: MMPIField, groups: Mapping[str, Sequence[Parameter]], phase: str) -> None:
+    """Freezes what a phase does not train, before each step.
+
+    Args:
+        field: marks the texels that training rays read while MPIs train alone.
+        groups: parameters by kind.
+        phase: by name.
+    """
+    field.marks_texels = phase == "individual"
+    for kind, params in groups.items():
+        params[0].requires_grad_(kind in TRAINS[phase])
+
+
+def release_untrained(field: TexelTables, phase: str, is_first_step: bool) -> list[Int[Tensor, "K"] | None]:
+    """Empties what no ray has trained before the first step of blending; bricks that remain, as ``release_unused``."""
+    return [field.release_untouched()] if phase == "blend" and is_first_step else []
+
+
+def assign_heads(
+    ray_bundle: RayBundle,
+    plan: ScenePlan,
+    phase: str,
+    rays_per_mpi: Literal["split", "all"],
+    draws: Generators,
+    step: int,
+) -> tuple[RayBundle, Bool[Tensor, "R H"] | None, Float[Tensor, "R K"] | None]:
+    """Rays of a training batch as its phase renders them.
+
+    Args:
+        ray_bundle: of the batch.
+        plan: of the scene, of K MPIs and H heads.
+        phase: by name.
+        rays_per_mpi: while MPIs train alone, each ray is for one of them (split) or for every one in turn (all).
+        draws: the one of a ray.
+        step: of the training.
+
+    Returns:
+        The rays, all of them again for every MPI where each renders all; heads that may render each ray, None for all;
+        and priorities of the MPIs, of which the first that a ray meets renders it, None for all.
+    """
+    count, num_mpis, device = len(ray_bundle), len(plan.mpis), ray_bundle.origins.device
+    if phase != "individual" or num_mpis == 1:
+        return ray_bundle, None, None
+    if rays_per_mpi == "split":
+        priorities = torch.rand(count, num_mpis, generator=draws.of(step, "assignment"), device=device)
+        return ray_bundle, None, priorities
+    heads = torch.arange(num_mpis, device=device).repeat_interleave(count)
+    head_mask = torch.arange(plan.num_heads, device=device) == heads[:, None]
+    head_mask[:, num_mpis:].fill_(True)  # the cube
+    return ray_bundle.broadcast_to((num_mpis, count)).flatten(), head_mask, None
+
+
+def blends_in(phase: str, field: MMPIField) -> bool:
+    """Whether a phase renders the heads of a field blended by reliability."""
+    return "reliability" in TRAINS[phase] and field.blends
