@@ -48,7 +48,8 @@ class Window:
         self.camera = max(viewer.viser_server.get_clients().items())[1].camera
 
     def click(self, kind, text):
-        self.tab.evaluate(f"[...document.querySelectorAll('{kind}')].find(e => e.textContent == '{text}').click()")
+        found = f"[...document.querySelectorAll('{kind}')].find(e => e.textContent == '{text}')"
+        self.tab.until(f"({found}?.click(), !!{found})")  # the page hears of it after the server
 
     def training_image(self, i):
         """What the window's field of view holds of a training image."""
@@ -135,7 +136,7 @@ def test_windows_open_at_a_training_image_look_round_in_place_and_find_back(tmp_
         with pytest.raises(KeyboardInterrupt):
             run_viewer.RunViewer(config.get_base_dir() / "config.yml").main()
     for viewer in (trainer.viewer_state, *viewers):
-        for machine in viewer.render_statemachines.values():
+        for machine in [*viewer.render_statemachines.values()]:
             machine.running = False
-            machine.join(10)
+            machine.join()  # a thread that renders when Python ends aborts it
         viewer.viser_server.stop()
