@@ -29,9 +29,10 @@ from mmpi_ns.utils.errors import duration, say
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order, num_threads
 from mmpi_priors.cache import Computed, digest, kept
+from mmpi_priors.clouds import POINT_ERROR, contradict, see_points
 from mmpi_priors.dense import SEARCH_SECONDS, SECONDS, Depth, find_depths
 from mmpi_priors.lone_depth import continued, is_lone
-from mmpi_priors.observe import POINT_ERROR, contradict, drop_masked, see_points
+from mmpi_priors.observe import drop_masked
 from mmpi_priors.views import Map, View, look_up, straightened, strips
 
 FINER, LONGEST = 2.0, 1600

@@ -14,7 +14,7 @@ import torch
 P = "--pipeline.model.placement."
 JOINT = ("--pipeline.model.schedule.training", "joint")
 NO_TRACKS = ("--pipeline.datamanager.priors.sfm-path", "none", "--pipeline.datamanager.priors.triangulate", "False")
-"""Options of our methods that leave pycolmap out: points are looked for on surfaces (``capture/observe.py``)."""
+"""Options of our methods that leave pycolmap out: points are looked for on surfaces (``mmpi_priors/observe.py``)."""
 BARE = () if importlib.util.find_spec("pycolmap") else NO_TRACKS
 """Options of our methods on a machine without pycolmap."""
 

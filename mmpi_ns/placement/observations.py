@@ -58,7 +58,7 @@ class Observations:
     """[M, G, G, 3] unit directions, in camera axes, through a grid over each image from border to border, row after
     row; None if all cameras are pinholes."""
     loose: Array | None = None
-    """[L, 3] points of a cloud that does not record which images saw them (``capture/observe.py`` finds out)."""
+    """[L, 3] points of a cloud that does not record which images saw them (``mmpi_priors/clouds.py`` finds out)."""
 
     @property
     def centers(self) -> Array:

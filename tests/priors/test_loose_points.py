@@ -9,7 +9,7 @@ import pytest
 
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
-from mmpi_priors.observe import FARTHEST, MOST_POINTS, see_points, usable_points
+from mmpi_priors.clouds import FARTHEST, MOST_POINTS, see_points, usable_points
 
 BACK = np.concatenate([np.diag([-1.0, 1, -1]), np.zeros((3, 1))], 1)
 SIZE = np.array([400.0, 300])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mmpi_priors.observe import read_ply
+from mmpi_priors.clouds import read_ply
 
 
 def test_points_keep_all_their_digits(tmp_path):
