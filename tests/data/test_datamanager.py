@@ -10,11 +10,11 @@ import sys
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
-from training_runs import datamanager, in_capture_frame, plan_of, ready, trainer_config, write_plan
+from training_runs import datamanager, in_capture_frame, ready, trainer_config, write_plan
 
 from mmpi_ns.data import rays
 from mmpi_ns.data.checks import say_once
@@ -105,12 +105,6 @@ def test_a_batch_holds_the_colours_of_the_pixels_that_its_rays_pass(manager):
     assert torch.allclose(rays.directions[:64], wanted.directions, atol=1e-6)
     assert torch.allclose(rays.origins[:64], wanted.origins)
     assert (rays.keypoint_disparities[:64] == 0).all() and (rays.keypoint_disparities[64:] > 0).all()
-
-
-def test_every_training_pixel_can_be_drawn(manager):
-    assert len(manager.sources.pixels.colors) == len(TRAIN) * WIDTH * HEIGHT
-    drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(30)])
-    assert set(drawn[:, 0].tolist()) == set(range(6)) and drawn[:, 1].max() > 20 and drawn[:, 2].max() > 28
 
 
 def test_masked_pixels_are_never_drawn(tmp_path):
@@ -241,23 +235,6 @@ def test_a_run_without_any_depth_says_so_and_draws_pixels(scene, capsys, setting
     assert (len(manager.next_train(0)[0]) == 64) == says
 
 
-def test_new_views_are_drawn_by_window_where_pixels_are_read_by_window(scene):
-    manager = datamanager(scene, new_view_share=1.0, resident_pixels=10.0)
-    assert manager.sources is None, "nothing is read before a window asks"
-    manager.use_cameras(np.array([0, 1, 2]))
-    assert set(manager.sources.new_views.pixels[:, 0].tolist()) <= {0, 1, 2}
-
-
-def test_one_window_of_more_pixels_than_are_held_has_its_new_views_and_keypoints(scene):
-    """In a run; they were missing in all of it."""
-    all_held, some = (datamanager(scene, new_view_share=1.0, resident_pixels=n) for n in (60e6, 1000.0))
-    some.use_cameras(None)
-    assert len(some.sources.pixels.colors) <= 1000 < len(all_held.sources.pixels.colors)
-    assert torch.equal(some.sources.new_views.pixels, all_held.sources.new_views.pixels)
-    assert torch.equal(some.sources.keypoints.camera_indices, all_held.sources.keypoints.camera_indices)
-    assert len(some.next_train(0)[0]) == 128
-
-
 @pytest.mark.parametrize(("settings", "shares"), [
     ({}, "80 % pixels, 0 % new views (--pipeline.datamanager.new-view-share 0), 20 % keypoints"),
     ({"new_view_share": 1.0}, "50 % pixels, 50 % new views, 0 % keypoints (new views take their place)"),
@@ -294,13 +271,6 @@ def test_the_placement_rule_makes_a_plan_for_the_scene(manager):
     plan = place(manager.observations, PlacementConfig())
     assert isinstance(plan, ScenePlan) and plan == place(manager.observations, PlacementConfig())
     assert ScenePlan.from_json(plan.to_json()) == plan
-
-
-def test_a_hand_written_plan_covers_the_wall(manager):
-    plan = plan_of(manager.observations)
-    for mpi in plan.mpis:
-        local = (wall_in_scene_units(manager) - mpi.origin) @ np.array(mpi.axes).T
-        assert (local[:, 2] > mpi.near).all() and (np.abs(local[:, 0] / local[:, 2]) < 1).mean() > 0.9
 
 
 def test_keypoints_on_masked_pixels_are_left_out(tmp_path, manager):
@@ -363,32 +333,6 @@ def test_rays_through_a_lens_are_nerfstudios(scene, kind, monkeypatch):
         image, whole = image_rays(alone), alone.generate_rays(camera_indices=0, keep_shape=True)
         assert image.directions.shape == whole.directions.shape
         assert torch.allclose(image.directions, whole.directions, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("kind", "lens"),
-    [
-        (CameraType.PERSPECTIVE, (-0.08, 0.02, 0.0, 0.0, 1e-3, -5e-4)),
-        (CameraType.FISHEYE, (0.02, -0.005, 1e-3, 0.0, 0.0, 0.0)),
-        (CameraType.FISHEYE, (0.0,) * 6),
-    ],
-)
-def test_the_directions_of_a_lens_have_nerfstudios_bits(kind, lens, monkeypatch):
-    """In parts that end within the image; the principal point lies between pixels."""
-    monkeypatch.setattr(rays, "UNDISTORTED", 7 * 50)
-    sizes = {"fx": 40.0, "fy": 41.5, "cx": 24.3, "cy": 20.0, "width": 50, "height": 40}
-    camera = Cameras(torch.eye(4)[None, :3], **sizes, distortion_params=torch.tensor([lens]), camera_type=kind)
-    theirs = camera.generate_rays(0, keep_shape=True).directions
-    ours = rays.pixel_directions((*sizes.values(), kind.value, *lens))
-    assert torch.equal(ours, theirs.view(-1, 3))
-
-
-def test_the_middle_of_a_fisheye_looks_ahead(scene):
-    cameras = copy.deepcopy(datamanager(scene).train_dataset.cameras)[0:1]
-    cameras.camera_type = torch.full_like(cameras.camera_type, CameraType.FISHEYE.value)
-    cameras.cx[:], cameras.cy[:] = 10.5, 7.5
-    middle = CameraRays.of(cameras, "cpu")(torch.tensor([[0, 7, 10]])).directions[0]
-    assert torch.allclose(middle, -cameras.camera_to_worlds[0, :, 2], atol=1e-6)
 
 
 def test_other_cameras_are_left_to_nerfstudio(scene, monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -11,15 +10,12 @@ import torch
 import torchmetrics.image.lpip
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.model_components import renderers
 from random_scenes import dense_grad
 from tiny_scene import HEIGHT, WIDTH, write_scene
-from training_runs import plan_of, ready, trainer_config, write_plan
+from training_runs import ready, trainer_config, write_plan
 
 import mmpi_ns.model
-from mmpi_ns import model as mmpi_model
 from mmpi_ns.config import mmpi_small
-from mmpi_ns.training import losses
 from mmpi_ns.training.losses import TV_EVERY
 from mmpi_ns.training.phases import TRAINS
 
@@ -90,20 +86,6 @@ def test_total_variation_is_added_every_few_steps_while_densities_train(scene, p
     assert "tv" not in run_step(trainer, -(-blend // TV_EVERY) * TV_EVERY)[1]
 
 
-def test_the_densest_planes_decide_how_exact_a_depth_priors_can_be(scene, tmp_path, monkeypatch):
-    plan = write_plan(scene, tmp_path / "plan.json", num_mpis=2)
-    words = json.loads(plan.read_text())
-    words["mpis"][1]["planes"] = 2
-    plan.write_text(json.dumps(words))
-    targets, sums = [], losses.depth_sums
-    monkeypatch.setattr(losses, "depth_sums", lambda *tensors: targets.append(tensors[4]) or sums(*tensors))
-    run_step(trainer_of(scene, plan, tmp_path, training="joint"), 0)
-    spacing = 1 / (words["mpis"][0]["near"] * (words["mpis"][0]["planes"] - 1))
-    assert spacing < 0.2 / words["mpis"][1]["near"]
-    of_pixels = targets[0][:64, 1]  # keypoints have windows of their own
-    assert of_pixels.min().item() == pytest.approx(0.6 * spacing, rel=1e-2)
-
-
 def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_file, tmp_path):
     trainer = trainer_of(scene, plan_file, tmp_path, sampling__threshold=0.0)
 
@@ -129,18 +111,6 @@ def test_with_rays_per_mpi_all_every_mpi_renders_every_ray_alone_with_the_cube(s
         assert set(heads[part][valid[part]].tolist()) == {k, 3}
     assert torch.equal(rays.bundle.origins[:80], rays.bundle.origins[160:])
     assert all(torch.isfinite(v) for v in losses.values())
-
-
-def test_three_equal_mpis_that_render_all_rays_have_the_losses_of_one(scene, tmp_path, trained):
-    one = plan_of(trained.pipeline.datamanager.observations, num_mpis=1)
-    losses = []
-    for count in (1, 3):
-        mpis = tuple(one.mpis[0].__class__(**{**vars(one.mpis[0]), "name": f"mpi{k}"}) for k in range(count))
-        path = tmp_path / f"{count}.json"
-        path.write_text(one.__class__(mpis, None, one.ray_near, one.content_near).to_json())
-        losses.append(run_step(trainer_of(scene, path, tmp_path / str(count), rays_per_mpi="all"), 0)[1])
-    for name in ("rgb_loss", "point_color", "distortion", "keypoint_depth"):
-        assert losses[1][name].item() == pytest.approx(losses[0][name].item(), rel=1e-2), name
 
 
 def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path):
@@ -244,21 +214,6 @@ def test_pictures_do_not_depend_on_the_chunk_size(model, camera, monkeypatch, th
         assert (found[0]["winning_mpi"] == other["winning_mpi"]).float().mean() > 0.995
 
 
-def test_chunks_have_the_size_that_suits_the_device_unless_another_is_asked_for(model, camera, monkeypatch):
-    sizes = []
-    monkeypatch.setattr(mmpi_model, "rays_per_chunk", lambda *_: 100)
-    render = model.window_outputs
-    monkeypatch.setattr(
-        model, "window_outputs", lambda w, field, rays, *more: sizes.append(len(rays)) or render(w, field, rays, *more)
-    )
-    for asked, expected in ((0, 100), (17, 17)):
-        sizes.clear()
-        monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", asked)
-        model.get_outputs_for_camera(camera)
-        assert max(sizes) == expected and sum(sizes) == WIDTH * HEIGHT
-        assert model.config.eval_num_rays_per_chunk == asked
-
-
 def test_depth_is_the_distance_along_the_ray_and_finite_at_infinity(model, camera):
     outputs = model.get_outputs_for_camera(camera)
     plan = model.field.plan
@@ -289,22 +244,6 @@ def test_a_crop_shows_the_background_around_a_box(model, camera):
     assert (cropped["accumulation"][misses] == 0).all() and (cropped["rgb"][misses] == 0.5).all()
     assert cropped["accumulation"][~misses].max() > 0.05 and torch.isfinite(cropped["depth"]).all()
     assert (cropped["accumulation"] <= outputs["accumulation"] + 1e-4).all()
-
-
-def test_a_colour_asked_for_by_the_viewer_or_a_crop_is_the_background(model, camera):
-    rays = camera.generate_rays(0, keep_shape=False)
-    rays.nears = rays.fars = torch.full_like(rays.pixel_area, 1e10)
-    assert (model(rays)["rgb"] == 0.5).all()
-    with renderers.background_color_override_context(torch.tensor([1.0, 0.0, 0.25])):
-        assert torch.equal(model(rays)["rgb"], torch.tensor([[1.0, 0.0, 0.25]]).expand(len(rays), 3))
-
-
-def test_a_picture_with_transparency_can_be_asked_for(model, camera):
-    outputs = model.get_outputs_for_camera(camera)
-    rgba = model.get_rgba_image(outputs)
-    assert rgba.shape == (HEIGHT, WIDTH, 4) and torch.equal(rgba[..., 3:], outputs["accumulation"])
-    over_gray = rgba[..., :3] * rgba[..., 3:] + 0.5 * (1 - rgba[..., 3:])
-    assert torch.allclose(over_gray, outputs["rgb"], atol=1e-4)
 
 
 def test_a_bare_ray_bundle_is_rendered(model):

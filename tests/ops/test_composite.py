@@ -132,19 +132,6 @@ def test_median_distance_is_where_half_of_the_gathered_weight_is_reached():
     assert median[:, 0].tolist() == [2.0, 3.0, 0.0, 2.0, 0.0]
 
 
-def test_median_distance_of_a_ray_does_not_depend_on_the_batch():
-    rng = np.random.default_rng(4)
-    weights = tensor(rng.random((64, 30)), torch.float32)
-    inverse_t = tensor(-np.sort(-rng.random((64, 30))), torch.float32)
-    valid = torch.ones(64, 30, dtype=torch.bool)
-    whole = median_inverse_distance(weights, inverse_t, valid)
-    parts = [slice(i, i + 5) for i in range(0, 64, 5)]
-    chunks = [median_inverse_distance(weights[p], inverse_t[p], valid[p]) for p in parts]
-    assert torch.equal(whole, torch.cat(chunks))
-    wanted = [oracle.median_inverse_distance(w, q) for w, q in zip(weights.tolist(), inverse_t.tolist(), strict=True)]
-    assert whole[:, 0].tolist() == wanted
-
-
 # A whole ray ---------------------------------------------------------------------------------------------------------
 
 

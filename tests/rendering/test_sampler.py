@@ -172,21 +172,6 @@ def test_a_ray_is_explained_when_it_enters_before_the_first_content_and_stays_to
     assert not ray_explained(one, [0, 0, -3], [0, 0, 1]), "reaches the first plane far behind the first content"
 
 
-def test_two_mpis_explain_a_ray_together():
-    side = make_mpi("right", (0.0, 0.0, 0.0), ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
-    front = make_mpi()
-    both, alone = (ScenePlan(m, None, 0.05, content_near=2.0) for m in ((front, side), (front,)))
-    start, direction = [0, 0, 1.5], [1.5, 0, 1]
-    assert ray_explained(both, start, direction) and not ray_explained(alone, start, direction)
-    assert ray_explained(alone, [0, 0, 0], [0, 0, 1]) and ray_explained(both, [0, 0, 0], [0, 0, 1])
-
-
-def test_the_cube_explains_no_ray():
-    cube = CubePlan((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0), (4, 4, 4))
-    plan = ScenePlan((make_mpi(),), cube, 0.05, 1.5)
-    assert not ray_explained(plan, [0, 0, 0], [0, 0, -1])
-
-
 def test_without_other_heads_all_that_a_ray_shows_is_to_be_explained():
     one = ScenePlan((make_mpi(near=1.0, extent=(-1.0, 1.0, -0.5, 0.5)),), None, 0.05, content_near=1.5)
     partly = [0, 0, 1.5], [1.3, 0, 1]

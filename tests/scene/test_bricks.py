@@ -10,7 +10,7 @@ from bricked import SHAPES, big_plan, bricked_field, chance, layout_of, thinned
 from random_fields import bundle, compare, random_rays, render, sampled
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.tables import ENOUGH_CROSSINGS, RELEASED_DENSITY, TABLES
+from mmpi_ns.field.tables import RELEASED_DENSITY, TABLES
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate_densely, texel_rows
 from mmpi_ns.ops.variation import total_variation
@@ -18,7 +18,6 @@ from mmpi_ns.scene.bricks import (
     grown_tiles,
     new_table,
     resample,
-    write_planes,
 )
 from mmpi_ns.scene.texels import BRICK, make_grids, number_tiles
 from mmpi_ns.training.touched_adam import TouchedAdam
@@ -87,17 +86,6 @@ def test_neighbours_are_the_stored_texels_beside_a_texel():
             assert there == [float(w >= BRICK) for w in wanted]
 
 
-def test_planes_are_written_as_images():
-    grids, table, blocks = thinned(SHAPES)
-    copy = table.clone()
-    for grid, block in zip(grids, blocks, strict=True):
-        for planes in (slice(None), slice(grid.depth - 1, grid.depth)):
-            write_planes(copy, grid, planes, torch.tensor(-block[planes]))
-        stored = grid.rows[grid.rows >= BRICK]
-        assert torch.equal(copy[stored], -table[stored])
-    assert torch.equal(copy[:BRICK], table[:BRICK]), "images of tiles that hold nothing go nowhere"
-
-
 # Rays ----------------------------------------------------------------------------------------------------------------
 
 
@@ -123,15 +111,6 @@ def test_the_march_leaves_out_what_holds_nothing_and_keeps_the_rest(monkeypatch,
     assert (fast.rgb - plain.rgb).abs()[same].max() < 3e-5
     assert (fast.composite.transmittance - plain.composite.transmittance).abs().max() < 1.2e-5
     assert torch.equal(fast.samples.live, plain.samples.live)
-
-
-def test_colours_without_gradients_equal_those_with():
-    field = bricked_field().eval()
-    samples = sampled(field, bundle(*random_rays(field.plan, 60, seed=8)))
-    with torch.no_grad():
-        fast = field.get_outputs(*samples)
-    plain = field.get_outputs(*samples, field.get_density(*samples)[1])
-    assert plain.std() > 0.05 and (fast - plain).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("order", ["rising", "anyhow"])
@@ -283,15 +262,6 @@ def test_a_release_changes_images_by_no_more_than_what_it_gives_up():
     assert (change <= 2 * given_up + 1e-5).all() and change.max() > 1e-4
     heavy = before.composite.weights >= least
     assert (after.composite.weights[heavy] >= before.composite.weights[heavy] - 1e-5).all()
-
-
-def test_nothing_is_given_up_before_enough_rays_were_seen():
-    field = bricked_field()
-    few = bundle(*random_rays(field.plan, 5, seed=3))
-    _, kept = used(field, few, least=0.5)
-    assert kept is None and float(field.crossings) == 0 and not field.peak.any(), "the next look starts afresh"
-    field.crossings.fill_(ENOUGH_CROSSINGS * field.num_bricks)
-    assert field.release_unused(0.5) is not None and field.num_bricks == 0
 
 
 def test_moments_and_marks_follow_their_texels():

@@ -103,15 +103,3 @@ def test_opacities_agree_with_finite_differences():
     found = splat_errors(gaussians, VIEW, colors, *given)[:, 4:].numpy()
     assert (expected[:, 1] > 0.1).sum() > 4
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.02)
-
-
-@pytest.mark.parametrize("wrong", range(3))
-def test_arrays_of_a_wrong_shape_are_refused(wrong):
-    gaussians, colors = some()
-    image = torch.zeros(*VIEW.size[::-1], 3)
-    tensors = [colors, image, image]
-    tensors[wrong] = tensors[wrong][:-1]
-    with pytest.raises(ValueError, match="has the shape"):
-        splat_errors(gaussians, VIEW, *tensors)
-    with pytest.raises(ValueError, match="has the shape"):
-        splat_image(gaussians._replace(alphas=gaussians.alphas[1:]), VIEW, colors)

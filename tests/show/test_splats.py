@@ -89,18 +89,6 @@ def test_neighbours_that_agree_become_one(window):
     assert len(few.means) == 50
 
 
-def test_torch_takes_one_thread_while_splats_are_made(window, monkeypatch, three_threads):
-    threads, texels = [], splats._texels
-    monkeypatch.setattr(splats, "_texels", lambda *v: threads.append(torch.get_num_threads()) or texels(*v))
-    splats.splats_of(window, cameras(window), 0.0, 50, rounds=0)
-    assert threads == [1] and torch.get_num_threads() == 3
-
-
-def test_a_weight_that_no_texel_has_is_refused(window):
-    with pytest.raises(ValueError, match="give a smaller --weight"):
-        splats.splats_of(window, cameras(window), 1.5, 100)
-
-
 def test_fitted_colours_come_closer_to_the_window(window):
     """Each round brings images of the splats closer to those of the bricks, also from between the cameras."""
     poses = cameras(window)
@@ -136,19 +124,6 @@ def test_fitted_opacities_help(window, monkeypatch):
         return sum(float((a.reshape(-1, 3) - b).square().mean()) for a, b in zip(images, targets, strict=True))
 
     assert error(splats.OPACITY_STEP) < 0.95 * error(0.0)
-
-
-def test_splats_do_not_depend_on_the_number_of_threads(window):
-    """Cameras are shared out; what they add up to is added in their order."""
-    poses = cameras(window)
-    alone = splats.splats_of(window, poses, 0.01, 10**6, rounds=2)
-    torch.set_num_threads(2)
-    try:
-        shared = splats.splats_of(window, poses, 0.01, 10**6, rounds=2)
-    finally:
-        torch.set_num_threads(1)
-    for name in ("means", "scales", "alphas", "colors"):
-        assert torch.equal(getattr(alone, name), getattr(shared, name)), name
 
 
 def view_of(pose):

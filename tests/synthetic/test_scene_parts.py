@@ -10,7 +10,7 @@ import pytest
 from procedural import keypoint_errors
 
 from mmpi_scene import Scene, make_scene, sfm_points, write_dataset
-from mmpi_scene.primitives import BOX, SPHERE, Kit, Tracer
+from mmpi_scene.primitives import BOX, SPHERE
 
 
 @pytest.fixture(scope="module")
@@ -57,24 +57,6 @@ def test_first_hits_are_those_of_a_slow_search_through_every_solid(name):
     assert np.allclose(every[row[hit], np.flatnonzero(hit)], wanted[hit], rtol=1e-9) and (row[~hit] == -1).all()
 
 
-def test_a_box_turns_from_x_to_y():
-    kit = Kit(0, 0)
-    kit.box((6.0, 0.0, 1.0), (4.0, 0.4, 2.0), "plaster", (0.5,) * 3, yaw=np.pi / 6)
-    tracer = Tracer(kit.done(), 100.0)
-    along = 1.8 * np.array([[np.cos(np.pi / 6), np.sin(np.pi / 6)], [np.cos(np.pi / 6), -np.sin(np.pi / 6)]])
-    above = np.column_stack([np.add(along, [6.0, 0.0]), [9.0, 9.0]])
-    distance, row = tracer(above, np.tile([0.0, 0.0, -1.0], (2, 1)))
-    assert distance.tolist() == [7.0, np.inf] and row.tolist() == [0, -1]
-
-
-def test_solids_beyond_reach_or_limit_do_not_count():
-    kit = Kit(0, 0)
-    kit.box((5.5, 0.0, 1.5), (1.0, 30.0, 30.0), "plaster", (0.5,) * 3)  # its bounding sphere is near in any case
-    ray = np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]])
-    assert Tracer(kit.done(), 5.1)(*ray)[0][0] == 5 and np.isinf(Tracer(kit.done(), 4.9)(*ray)[0][0])
-    assert np.isinf(Tracer(kit.done(), 100.0)(*ray, limit=4.9)[0][0])
-
-
 def test_tracks_are_near_enough_and_have_the_colours_that_cameras_see(street):
     scene = replace(street, track_range=14.0)
     found = sfm_points(scene, 300, noise_pixels=0.0, outliers=0.0)
@@ -88,19 +70,6 @@ def test_tracks_are_near_enough_and_have_the_colours_that_cameras_see(street):
     assert np.median(np.abs(found.colors / 255 - seen).max(-1)) < 0.03
     warmth = [c[:, 0] - c[:, 2] for c in (found.colors / 255, seen)]
     assert np.corrcoef(*warmth)[0, 1] > 0.9
-
-
-def test_rays_of_a_track_lie_apart():
-    """On a drive of a metre and a half, most of what is far ahead cannot be triangulated."""
-    scene = make_scene("street", count=5, width=96, height=48, length=1.5)
-    found = sfm_points(scene, 200, noise_pixels=0.0, outliers=0.0)
-    rays = found.true_points[found.point] - scene.cameras.camera_to_worlds[found.camera, :, 3]
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    widest = []
-    for p in range(len(found.points)):
-        own = rays[found.point == p]
-        widest.append(np.degrees(np.arccos(np.clip((own @ own.T).min(), -1, 1))))
-    assert len(widest) > 100 and 0.5 <= min(widest) < 0.7
 
 
 def test_files_hold_the_points_their_colours_and_tracks(street, tmp_path):

@@ -14,9 +14,6 @@ from reprojection import median_reprojection_error
 
 from mmpi_priors.sfm import find_sfm_model
 from mmpi_scene import SCENES, Cameras, Scene, make_scene, render, sfm_points, write_dataset
-from mmpi_scene.__main__ import SceneCommand
-from mmpi_scene.dataset import PARTS
-from mmpi_scene.materials import Noise, pulse
 from mmpi_scene.primitives import Kit, look
 from mmpi_scene.road import Road
 from mmpi_scene.scene import Light
@@ -165,27 +162,6 @@ def test_images_are_antialiased(street):
     assert error(image) < 0.025 and error(image) < 0.5 * error(aliased)
 
 
-def test_textures_average_over_their_footprint():
-    x, width = np.linspace(-2, 3, 50, dtype=np.float32), np.full(50, 0.37, np.float32)
-    fine = x[:, None] + 0.37 * ((np.arange(2000) + 0.5) / 2000 - 0.5)
-    inside = ((fine % 1 >= 0.2) & (fine % 1 < 0.5)).mean(1)
-    assert np.allclose(pulse(x, width, 0.2, 0.5), inside, atol=2e-3)
-    noise, u = Noise(0), np.random.default_rng(0).uniform(0, 99, (2, 5000)).astype(np.float32)
-    spread = [float(noise(*u, np.full(5000, w, np.float32)).std()) for w in (0.01, 1.0, 20.0)]
-    assert 0.4 < spread[0] < 0.6 and spread[0] > spread[1] > 0.1 and spread[2] < 0.01
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_no_image_is_plain(name):
-    """Colours vary, and vary within small neighbourhoods too."""
-    scene = make_scene(name, count=4, width=64, height=40, **({"length": 20.0} if SCENES[name].length else {}))
-    for i in range(0, 4, 2):
-        image = render(scene, i)[0]
-        assert image.std() > 0.08
-        blocks = image.reshape(5, 8, 8, 8, 3).std((1, 3)).mean(-1)
-        assert (blocks > 0.005).mean() > 0.9
-
-
 # Points and tracks
 
 
@@ -216,19 +192,6 @@ def test_what_stands_in_front_hides_a_point():
     point = np.array([[9.5, 0.0, 1.5], [9.5, 3.0, 1.5]])
     assert [visible(open_view, i, point)[0].tolist() for i in range(5)] == [[True, True]] * 5
     assert [visible(hidden, i, point)[0][0] for i in range(5)] == [True, True, False, True, True]
-
-
-def test_keypoint_noise_is_as_asked(street, street_points):
-    found = street_points
-    for camera in range(len(street.cameras)):
-        rows = (found.camera == camera) & ~found.outlier[found.point]
-        exact = street.cameras.project(camera, found.true_points[found.point[rows]])[0]
-        assert np.abs((found.pixel[rows] - exact).std(0) - 0.4).max() < 0.08
-        assert np.abs((found.pixel[rows] - exact).mean()) < 0.08
-    # Triangulation takes up three of two numbers a keypoint.
-    error = keypoint_errors(street, found)
-    share = 1 - 3 * len(found.points) / (2 * len(found.point))
-    assert np.isclose(np.sqrt((error**2).mean() / 2), 0.4 * np.sqrt(share), rtol=0.08)
 
 
 def test_outliers_are_as_many_as_asked_and_fit_their_keypoints(street, street_points):
@@ -264,25 +227,6 @@ def test_a_road_is_as_long_as_asked_and_finds_its_own_places():
     found = road.locate(places)
     assert np.abs(found[0] - along).max() < 0.1 and np.abs(found[1] - aside).max() < 0.02
     assert np.abs(found[2] - heading).max() < 0.002 and np.ptp(heading) > 0.3
-
-
-def test_what_a_long_road_costs_grows_linearly_and_its_images_cost_no_more():
-    scenes = {n: make_scene("long-road", length=1000.0 * n) for n in (1, 4)}
-    solids = {n: len(s.primitives) for n, s in scenes.items()}
-    assert 2.6 < solids[4] / solids[1] < 4.2
-    near = {n: [len(s.tracer.near(x, x)) for x in s.cameras.camera_to_worlds[:, 0, 3]] for n, s in scenes.items()}
-    assert max(near[4]) < 1.25 * max(near[1]) and max(near[4]) < solids[4] / 4
-
-
-def test_ten_kilometres_of_cameras_without_images(tmp_path):
-    scene = make_scene("long-road", count=300, length=10000.0, width=64, height=32)
-    found = write_dataset(scene, tmp_path / "long", points=50, images=False)
-    assert len(found.points) == 0  # 33 m apart: no point is near enough to three cameras
-    model = find_sfm_model(tmp_path / "long" / "colmap" / "sparse" / "0")
-    assert model is not None and len(model.names) == 300 and len(model.points) == 0
-    meta = json.loads((tmp_path / "long" / "transforms.json").read_text())
-    assert len(meta["frames"]) == 300 and not (tmp_path / "long" / "images").exists()
-    assert np.ptp([f["transform_matrix"][0][3] for f in meta["frames"]]) > 8000
 
 
 # Data sets
@@ -362,18 +306,6 @@ def test_a_folder_in_use_is_left_as_it_is(tmp_path, monkeypatch, capsys):
             and "\n" not in message
         )
         assert [p.name for p in folder.iterdir()] == ["notes.txt"]
-
-
-def test_overwrite_replaces_a_data_set_whole(tmp_path, capsys):
-    options = {"width": 32, "height": 24, "points": 40}
-    SceneCommand("room", tmp_path / "out", count=4, **options).main()
-    assert f"ns-train mmpi --data {tmp_path / 'out'}" in capsys.readouterr().out
-    with pytest.raises(FileExistsError, match="--overwrite"):
-        SceneCommand("object", tmp_path / "out", count=3, **options).main()
-    assert len(list((tmp_path / "out" / "images").iterdir())) == 4
-    SceneCommand("object", tmp_path / "out", count=3, overwrite=True, **options).main()
-    assert len(list((tmp_path / "out" / "images").iterdir())) == 3
-    assert {p.name for p in (tmp_path / "out").iterdir()} <= set(PARTS)
 
 
 def test_impossible_scenes_are_refused_with_the_remedy():

@@ -11,9 +11,7 @@ from nerfstudio.engine.trainer import Trainer
 from training_runs import trainer_config
 
 from mmpi_ns.config import mmpi_small
-from mmpi_ns.training.options import check_run
 from mmpi_ns.utils import machine
-from mmpi_ns.utils.errors import InputError
 
 
 class Stop(Exception):
@@ -66,34 +64,3 @@ def system(monkeypatch, tmp_path):
         monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
 
     return make
-
-
-@pytest.mark.parametrize(
-    ("driver", "cuda", "words"),
-    [
-        ("535.104.05", "13.0", ["NVIDIA GeForce RTX 3090 with driver 535.104.05", "needs 580 or newer", "whl/cu126"]),
-        ("470.223", "13.0", ["needs 580", "whl/cu118"]),
-        ("390.157", "12.6", ["needs 525", "update the driver"]),
-        ("580.65.06", None, ["is built without CUDA", "whl/cu126"]),
-        ("580.65.06", "13.0", ["does not start", "torch.cuda.init()"]),
-    ],
-)
-def test_a_gpu_that_torch_does_not_see_is_named_with_what_mends_it(system, tmp_path, driver, cuda, words):
-    system(driver, cuda)
-    config = trainer_config(tmp_path, None, tmp_path)
-    config.machine.device_type = "cuda"
-    assert all(word in machine.unused_gpu() for word in words)
-    with pytest.raises(InputError, match="RTX 3090"):
-        check_run(config)
-
-
-def test_nothing_is_said_of_a_gpu_that_is_used_hidden_or_not_there(system, monkeypatch):
-    system("535.104.05", "13.0", gpus=0)
-    assert machine.unused_gpu() == ""
-    system("535.104.05", "13.0")
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert machine.unused_gpu() == ""
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
-    assert machine.unused_gpu()
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert machine.unused_gpu() == ""

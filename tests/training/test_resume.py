@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -93,13 +92,6 @@ def test_texels_become_finer_or_get_copies_where_the_plan_allows_it(whole):
 
 def test_steps_differ_so_the_comparison_can_fail(whole):
     assert len(differences(compared(load(whole[1], STEPS - 1)), compared(load(whole[1], STEPS - 2)))) > 5
-
-
-def test_untrained_reliability_takes_no_bytes_of_a_checkpoint(whole):
-    state = load(whole[1], 11)["pipeline"]
-    reliability, density = (state[f"_model.field.{name}"] for name in ("reliability", "density"))
-    assert reliability.shape == density.shape and not reliability.any() and density.any()
-    assert (reliability.untyped_storage().nbytes(), density.untyped_storage().nbytes()) == (4, 4 * len(density))
 
 
 def test_a_finished_run_has_nothing_to_do(whole, resumed):
@@ -217,22 +209,6 @@ def test_a_full_disk_leaves_the_old_checkpoint_and_nothing_else(scene, plan_file
     assert again._start_step == 4
 
 
-def test_checkpoints_are_written_outside_their_folder(whole, scene, plan_file, tmp_path, monkeypatch):
-    """nerfstudio takes every file name in the folder for a step, so an unfinished one there would break resuming."""
-    trainer = ready(trainer_config(scene, plan_file, tmp_path, 2))
-    save, seen = torch.save, []
-
-    def spy(state, path, *args, **kwargs):
-        save(state, path, *args, **kwargs)
-        seen.append((path.parent, [p.name for p in trainer.checkpoint_dir.iterdir()]))
-
-    monkeypatch.setattr(torch, "save", spy)
-    trainer.train()
-    assert len(seen) >= 2
-    for parent, names in seen:
-        assert parent != trainer.checkpoint_dir and all(n.endswith(".ckpt") for n in names)
-
-
 # What does not fit ---------------------------------------------------------------------------------------------------
 
 
@@ -255,21 +231,6 @@ def test_a_checkpoint_of_another_method_is_refused(whole, scene, plan_file, tmp_
     torch.save(state, folder / "step-000000005.ckpt")
     with pytest.raises(ValueError, match="not written by this method"):
         ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_dir=folder)
-
-
-def test_a_folder_without_checkpoints_is_named(scene, plan_file, tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="no checkpoint in"):
-        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS), load_dir=tmp_path / "empty")
-
-
-def test_one_checkpoint_file_can_be_named_instead_of_a_folder(whole, scene, plan_file, tmp_path):
-    copy = tmp_path / "mine.ckpt"
-    shutil.copy(whole[1] / "step-000000020.ckpt", copy)
-    trainer = ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_checkpoint=copy)
-    trainer.train()
-    found = load(trainer.checkpoint_dir, STEPS - 1)
-    assert differences(compared(load(whole[1], STEPS - 1)), compared(found)) == []
 
 
 def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning_rates(

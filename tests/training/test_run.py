@@ -97,18 +97,3 @@ def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(shar
     plane, y, x = place // 64, place // 8 % 8, place % 8
     assert (copy.own_tiles[plane, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2] > 0).all(), "the brick of the largest gain"
     assert mpi.own_tiles[plane, y, x] == 0, "which the MPI gives up"
-
-
-def test_without_errors_nothing_is_copied():
-    field = half_empty(64.0, 0.25)
-    copy_finely(field, torch.zeros(field.num_bricks + 1), Work(8, False), 10**12, [])
-    assert not field.copied
-
-
-@pytest.mark.parametrize(
-    ("detail", "factor", "width", "copied"), [(12.0, 3.0, 64, True), (12.0, 4.5, 64, False), (64.0, 1.0, 9000, False)]
-)
-def test_copies_are_for_plans_whose_rays_could_train_them_and_whose_sides_stay_allowed(detail, factor, width, copied):
-    plan = ScenePlan((make_mpi(planes=4, height=8, width=width),), None, 0.05, 1.5, detail=detail)
-    assert plan.may_be_copied(factor) == copied
-    assert len(plan.largest.mpis) == (1 if width == 9000 else 2)

@@ -107,18 +107,6 @@ def test_rays_are_mixed_by_where_they_start(whole):
     assert mixed["winning_mpi"][2] == 2 and mixed["winning_mpi"][0] < 2
 
 
-def test_one_mpi_can_be_shown_alone(whole):
-    model = whole.pipeline.model
-    origins = torch.tensor([model.progress.windows.windows[1].center]).float()
-    model.show.value = model.progress.windows.names[0]
-    try:
-        shown = rendered(model, origins)
-    finally:
-        model.show.value = "all"
-    assert shown["winning_mpi"].item() == 0
-    assert not torch.allclose(shown["rgb"], rendered(model, origins)["rgb"])
-
-
 def test_windows_that_are_not_trained_yet_are_not_asked(scene, windows_file, tmp_path):
     model = ready(trainer_config(scene, windows_file, tmp_path, STEPS, training="joint")).pipeline.model
     origins = torch.stack([torch.tensor(w.center).float() for w in model.progress.windows.windows])
@@ -161,21 +149,6 @@ def test_resuming_without_the_finished_windows_is_refused_in_one_sentence(whole,
         ready(config, load_dir=folder)
 
 
-def test_a_window_of_another_plan_or_a_damaged_one_is_not_taken_over(whole, tmp_path):
-    model, store = whole.pipeline.model, WindowStore(tmp_path / "mine", whole.pipeline.model._new_field)
-    ours, theirs = model.progress.windows.plans
-    with pytest.raises(ValueError, match="another scene plan"):
-        store.adopt(model.store.path(0).parent, {0: theirs})
-    (tmp_path / "cut").mkdir()
-    content = model.store.path(0).read_bytes()
-    (tmp_path / "cut" / model.store.path(0).name).write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match="cannot be read"):
-        store.adopt(tmp_path / "cut", {0: ours})
-    assert not (tmp_path / "mine").exists()
-    store.adopt(model.store.path(0).parent, {0: ours})
-    assert store.path(0).read_bytes() == content
-
-
 @pytest.mark.parametrize("harm, sentence", [("gone", "is missing"), ("cut", "is damaged")])
 def test_a_lost_window_is_named_and_nothing_else_is_touched(whole, harm, sentence):
     model = whole.pipeline.model
@@ -194,45 +167,6 @@ def test_a_lost_window_is_named_and_nothing_else_is_touched(whole, harm, sentenc
     finally:
         path.write_bytes(kept)
     assert model.progress.window == 1 and torch.equal(model.field.density, before)
-
-
-def test_a_full_disk_at_a_windows_end_keeps_the_checkpoint(scene, windows_file, tmp_path, monkeypatch):
-    trainer = ready(trainer_config(scene, windows_file, tmp_path, STEPS, training="joint"))
-    save = torch.save
-
-    def full(state, path, **settings):
-        if "window" in path.name:
-            path.write_bytes(b"half")
-            raise RuntimeError("[enforce fail at inline_container.cc] PytorchStreamWriter failed")
-        return save(state, path, **settings)
-
-    monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(OSError, match="could not be written"):
-        trainer.train()
-    assert not list((trainer.base_dir / "windows").glob("*"))
-    assert load(trainer.checkpoint_dir, STEPS - 2)["step"] == STEPS - 2
-
-
-@pytest.mark.parametrize(
-    "room, held",
-    [
-        (0.0, [[0], [1], [0], [2], [1], [1]]),
-        (2.5, [[0], [0, 1], [1, 0], [0, 2], [2, 1], [2, 1]]),
-        (9.0, [[0], [0, 1], [1, 0], [1, 0, 2], [0, 2, 1], [0, 2, 1]]),
-    ],
-)
-def test_as_many_windows_are_held_as_fit_the_budget(whole, tmp_path, room, held):
-    """Windows of one size; ``room`` is for so many of them. The one that was not used for longest goes first."""
-    model = whole.pipeline.model
-    size = model.store.path(1).stat().st_size
-    store = WindowStore(tmp_path, model._new_field, budget=room * size)
-    for number in range(3):
-        store.save(number, model.field)
-    for number, expected in zip((0, 1, 0, 2, 1, 1), held, strict=True):
-        field = store.load(number, model.device)
-        assert torch.equal(field.density, model.field.density) and list(store._held) == expected
-        taken = sum(t.numel() * t.element_size() for f in store._held.values() for t in f.state_dict().values())
-        assert len(store._held) == 1 or taken <= room * size
 
 
 def test_an_image_between_two_windows_reads_each_from_disk_once(scene, windows_file, tmp_path, monkeypatch):

@@ -6,8 +6,8 @@ import shutil
 
 import numpy as np
 import pytest
-from forked import run, train
-from PIL import ExifTags, Image
+from forked import train
+from PIL import Image
 from tiny_scene import HEIGHT, WIDTH, name_of
 
 
@@ -47,32 +47,6 @@ def test_images_of_other_kinds_among_rgb_train(data, tmp_path, odd):
     assert "Training finished" in train(data, tmp_path).shown
 
 
-@pytest.mark.parametrize("ending", [".webp", ".png"])
-def test_webp_images_are_matched_whatever_their_ending(data, edit, tmp_path, ending):
-    def rename(meta):
-        for key in ("train", "val", "test"):
-            del meta[f"{key}_filenames"]
-        for frame in meta["frames"]:
-            path = data / frame["file_path"]
-            image = Image.open(path).convert("RGB")
-            path.unlink()
-            image.save(path.with_suffix(ending), format="WEBP", lossless=True)
-            frame["file_path"] = str(path.with_suffix(ending).relative_to(data))
-
-    edit(rename)
-    shutil.rmtree(data / "colmap")
-    shown = train(data, tmp_path).shown
-    assert "triangulated points" in shown and "Training finished" in shown
-
-
-def test_16_bit_pixels_become_the_nearest_of_8_bits(data):
-    from training_runs import datamanager
-
-    sixteen_bits(data)
-    image = datamanager(data, test_mode="inference").train_dataset.get_data(2, image_type="uint8")["image"]
-    assert image.shape == (HEIGHT, WIDTH, 3) and (image == 40_000 // 257).all()
-
-
 def float_image(path):
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.float32)).save(path, format="TIFF")
 
@@ -104,14 +78,6 @@ def test_an_image_of_another_size_is_named(data, tmp_path, i):
     said = ended.sentence
     assert f"{WIDTH + 2} x {HEIGHT} pixels and its camera {WIDTH} x {HEIGHT}" in said and "EXIF" not in said
     assert "matching" not in ended.out  # which takes minutes
-
-
-@pytest.mark.parametrize(("orientation", "named"), [(6, True), (8, True), (3, False)])
-def test_an_image_that_its_exif_alone_turns_is_refused_with_the_reason(data, tmp_path, orientation, named):
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    Image.new("RGB", (HEIGHT, WIDTH)).save(data / "images" / name_of(3), exif=exif)
-    assert ("its EXIF alone turns it" in train(data, tmp_path).sentence) == named
 
 
 ARRAYS = {
@@ -147,9 +113,3 @@ def test_downscaling_without_copies_says_which_there_are(data, tmp_path, factor)
     (data / "images_2").mkdir()
     said = train(data, tmp_path, pipeline__datamanager__dataparser__downscale_factor=factor).sentence
     assert "--downscale-factor" in said and (factor < 1 or "images_2" in said)
-
-
-@pytest.mark.parametrize("i", [3, 5])
-def test_mmpi_plan_reads_the_images_as_ns_train_does(data, tmp_path, i):
-    DAMAGED["cut short"](data / "images" / name_of(i))
-    assert name_of(i) in run("mmpi-plan", data, "--output", tmp_path / "plan").sentence

@@ -95,21 +95,10 @@ def test_a_method_of_the_paper_needs_a_number_of_steps():
         check_run(config)
 
 
-def test_images_scaled_down_to_nothing_are_refused(whole_scene, tmp_path):
-    said = train(whole_scene, tmp_path, **{D + "camera_res_scale_factor": 0.01}).sentence
-    assert option_of(D + "camera_res_scale_factor") in said and "no pixel" in said
-
-
 @pytest.mark.parametrize("name", IGNORED)
 def test_an_option_that_would_be_ignored_is_refused(whole_scene, tmp_path, name):
     said = train(whole_scene, tmp_path / "out", **{name: IGNORED[name]}).sentence
     assert option_of(name) in said and "no effect" in said
-
-
-def test_shares_that_leave_nothing_for_the_first_phase_are_refused(whole_scene, tmp_path):
-    shares = {M + "schedule__blend_share": 0.6, M + "schedule__finetune_share": 0.4}
-    said = train(whole_scene, tmp_path, **shares, pipeline__model__schedule__training="two-phase").sentence
-    assert "blend-share" in said and "first phase" in said
 
 
 @pytest.mark.parametrize(
@@ -127,12 +116,6 @@ def test_options_that_say_nothing_together_are_refused(whole_scene, tmp_path, ch
     assert all(word in said for word in words), said
 
 
-@pytest.mark.parametrize(("name", "value"), [("--placement.texel-pixels", "nan"), ("--placement.max-mpis", "0")])
-def test_mmpi_plan_refuses_the_same_options(whole_scene, tmp_path, name, value):
-    ended = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", name, value)
-    assert name in ended.sentence
-
-
 OTHER_COMMANDS = [
     *(("mmpi-scene street {out}", option, value) for option, value in (
         ("--width", "0"), ("--height", "-3"), ("--count", "0"), ("--length", "nan"), ("--points", "0"),
@@ -147,13 +130,6 @@ def test_other_commands_name_the_option_that_cannot_be_used(tmp_path, command, o
     words = command.format(out=tmp_path / "out").split()
     assert run(*words, option, value).sentence.startswith(f"{option} must be")
     assert not (tmp_path / "out").exists()
-
-
-def test_mmpi_scene_names_a_folder_that_cannot_be_written_before_it_looks_for_points(tmp_path):
-    (tmp_path / "notes.txt").write_text("a file")
-    ended = run("mmpi-scene", "street", tmp_path / "notes.txt/street")
-    assert "notes.txt/street cannot be written" in ended.sentence and "choose another folder" in ended.sentence
-    assert "looking for points" not in ended.out
 
 
 def test_seeds_of_the_machine_are_those_of_our_draws(whole_scene, tmp_path):

@@ -75,35 +75,6 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_plan_that_cannot_be_used_is_refused(whole_scene, plan_text, tmp_path, case):
-    change, words = REFUSED[case]
-    plan = json.loads(plan_text)
-    change(plan)
-    path = tmp_path / "plan.json"
-    path.write_text(json.dumps(plan))
-    said = train(whole_scene, tmp_path, pipeline__model__plan_file=path).sentence
-    assert said.startswith(f"{path}: ") and all(word in said for word in words), said
-
-
-FILES = {
-    "empty": b"", "cut short": b'{"mpis": [', "a list": b"[]", "latin-1": '{"mpis": "Straße"}'.encode("latin-1"),
-    "deep": b"[" * 100_000, "a picture": b"\x89PNG\r\n\x1a\n",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", FILES)
-def test_a_file_that_is_no_plan_is_named(whole_scene, tmp_path, case):
-    path = tmp_path / "plan.json"
-    path.write_bytes(FILES[case])
-    assert str(path) in train(whole_scene, tmp_path, pipeline__model__plan_file=path).sentence
-
-
-def test_a_plan_that_is_not_there_is_named(whole_scene, tmp_path):
-    said = train(whole_scene, tmp_path, pipeline__model__plan_file=tmp_path / "no.json").sentence
-    assert "There is no scene plan at" in said and "--pipeline.model.plan-file" in said
-
-
 def test_a_plan_that_is_usable_trains(whole_scene, plan_text, tmp_path):
     path = tmp_path / "plan.json"
     path.write_text(plan_text)
@@ -129,22 +100,6 @@ def test_a_plan_that_needs_more_memory_than_there_is_is_refused_before_anything_
     path.write_text(json.dumps(plan))
     ended = train(whole_scene, tmp_path, memory=2 << 30, pipeline__model__plan_file=path)
     assert "GiB" in ended.sentence and "fewer texels" in ended.sentence
-
-
-@pytest.mark.parametrize("case", ["planes '64'", "axes of texts", "near nan", "an MPI is a number"])
-def test_mmpi_plan_refuses_the_same_plans(whole_scene, plan_text, tmp_path, case):
-    change, words = REFUSED[case]
-    plan = json.loads(plan_text)
-    change(plan)
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
-    said = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", "--plan-file", tmp_path / "plan.json").sentence
-    assert all(word in said for word in words), said
-
-
-def test_mmpi_plan_names_a_folder_that_it_cannot_write(whole_scene, tmp_path):
-    (tmp_path / "o").write_text("")
-    said = run("mmpi-plan", whole_scene, "--output", tmp_path / "o" / "p").sentence
-    assert "cannot be written" in said and "--output" in said
 
 
 def test_mmpi_plan_does_not_replace_a_plan_that_was_edited(whole_scene, tmp_path):

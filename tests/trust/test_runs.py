@@ -14,7 +14,7 @@ import pytest
 import torch
 import yaml
 from forked import run, start_train, train
-from tiny_scene import TEST, name_of, write_scene
+from tiny_scene import TEST, name_of
 from training_runs import ready, trainer_config
 
 from mmpi_ns.training.trainer import MMPITrainer
@@ -167,46 +167,7 @@ def test_a_new_run_into_the_folder_of_an_old_one_is_refused(whole_scene, finishe
     }
 
 
-def test_what_a_killed_run_left_half_written_is_cleared_away(whole_scene, tmp_path):
-    folder = folder_of(tmp_path)
-    (folder / "windows").mkdir(parents=True)
-    left = [folder / ".step-000000001.ckpt.77.tmp", folder / "windows" / ".window-00000.pt.77.tmp"]
-    for path in left:
-        path.write_bytes(b"half")
-    assert train(whole_scene, tmp_path).status == 0
-    assert not any(path.exists() for path in left)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_named(whole_scene, tmp_path):
-    tmp_path.chmod(0o555)
-    assert "cannot be written" in train(whole_scene, tmp_path).sentence
-
-
-def test_an_output_folder_that_is_a_file_is_named(whole_scene, tmp_path):
-    (tmp_path / "out").write_text("")
-    said = train(whole_scene, tmp_path / "out").sentence
-    assert "cannot be written" in said and "--output-dir" in said
-
-
 # Resuming ------------------------------------------------------------------------------------------------------------
-
-
-def test_another_capture_with_the_old_plan_is_refused(whole_scene, trained, tmp_path):
-    other = write_scene(tmp_path / "other")
-    meta = json.loads((other / "transforms.json").read_text())
-    meta["frames"][0]["transform_matrix"][0][3] -= 0.2
-    (other / "transforms.json").write_text(json.dumps(meta))
-    said = train(
-        other, tmp_path, load_dir=trained / "nerfstudio_models", pipeline__model__plan_file=trained / "plan.json"
-    ).sentence
-    assert str(whole_scene) in said and str(other) in said and "another capture" in said
-
-
-def test_the_same_capture_in_another_folder_goes_on(whole_scene, trained, tmp_path):
-    moved = shutil.copytree(whole_scene, tmp_path / "moved")
-    said = train(moved, tmp_path, load_dir=trained / "nerfstudio_models", max_num_iterations=6).shown
-    assert "nothing to do" in said
 
 
 def test_another_plan_is_refused_and_what_differs_is_named(whole_scene, trained, tmp_path):
@@ -246,18 +207,6 @@ class Runs:
         return Path.touch, (self.path,)
 
 
-def test_no_checkpoint_is_said(whole_scene, finished, tmp_path):
-    (finished / "nerfstudio_models" / "step-000000005.ckpt").unlink()
-    assert "There is no checkpoint in" in evaluate(finished, tmp_path).sentence
-    assert "There is no checkpoint in" in train(whole_scene, tmp_path / "n", load_dir=finished).sentence
-    assert not (tmp_path / "n").exists()  # nothing was begun: matching may take minutes
-
-
-def test_a_step_that_is_not_there_is_said(whole_scene, trained, tmp_path):
-    said = train(whole_scene, tmp_path, load_dir=trained / "nerfstudio_models", load_step=3).sentence
-    assert "There is no step 3" in said and "[5]" in said
-
-
 STRAY = ("notes.txt", "step-9.ckpt.bak", ".DS_Store", "step-x.ckpt", "a folder")
 
 
@@ -293,47 +242,11 @@ def test_a_plan_that_was_edited_in_the_folder_of_a_run_is_not_replaced(whole_sce
 # Evaluating ----------------------------------------------------------------------------------------------------------
 
 
-def test_evaluation_takes_the_plan_from_the_checkpoint_and_places_nothing(finished, tmp_path):
-    ended = evaluate(finished, tmp_path)
-    assert ended.status == 0 and "Triangulated" not in ended.out and "SfM" not in ended.out
-    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 5
-
-
 def test_evaluation_says_psnr_and_ssim_with_the_worst_and_the_best_image(finished, tmp_path):
     said = evaluate(finished, tmp_path).shown
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
     assert f"2 images: PSNR {results['psnr']:.2f} dB (worst" in said and f"SSIM {results['ssim']:.3f} (" in said
     assert all(name_of(i) in said for i in TEST)
-
-
-@pytest.mark.parametrize(("option", "value"), [("--least", "nan"), ("--least", "-1"), ("--compare", "-3")])
-def test_mmpi_export_names_the_option_that_cannot_be_used(trained, tmp_path, option, value):
-    place = ("--load-config", trained / "config.yml", "--output", tmp_path / "out")
-    assert run("mmpi-export", "bake", *place, option, value).sentence.startswith(f"{option} must be")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("format", "name"), [("bake", "out"), ("splats", "out/scene.ply")])
-def test_mmpi_export_names_a_folder_that_cannot_be_written_before_it_bakes(trained, tmp_path, format, name):
-    (tmp_path / "notes.txt").write_text("a file")
-    place = ("--load-config", trained / "config.yml", "--output", tmp_path / "notes.txt" / name)
-    ended = run("mmpi-export", format, *place)
-    assert "notes.txt/out cannot be written" in ended.sentence and "choose another --output" in ended.sentence
-    assert "Loading" not in ended.out
-
-
-@pytest.mark.parametrize("text", ["", "hello", "a: [1,"])
-def test_mmpi_export_names_a_config_that_is_none(finished, text):
-    (finished / "config.yml").write_text(text)
-    assert (
-        "not a config.yml that ns-train wrote"
-        in run("mmpi-export", "bake", "--load-config", finished / "config.yml").sentence
-    )
-
-
-def test_a_checkpoint_file_that_is_not_there_is_said(whole_scene, tmp_path):
-    said = train(whole_scene, tmp_path, load_checkpoint=tmp_path / "no.ckpt").sentence
-    assert "There is no checkpoint at" in said and "--load-checkpoint" in said
 
 
 def test_a_checkpoint_cannot_run_code(whole_scene, finished, tmp_path):
