@@ -17,6 +17,9 @@ PYTHON_OK := import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_in
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.10 python3; do \
 	if "$$p" -c '$(PYTHON_OK)' >/dev/null 2>&1; then echo "$$p"; break; fi; done)
 
+# `make venv TORCH=cpu` takes torch's builds for a CPU, of 0.2 instead of 3 GB; empty: those of the package index.
+TORCH ?=
+
 # Processes that share the test files out; a test uses one thread.
 WORKERS ?= 2
 
@@ -43,6 +46,11 @@ $(STAMP): pyproject.toml constraints.txt
 		fi; \
 		echo "Making $(VENV) with $$python"; \
 		"$$python" -m venv --clear $(VENV); \
+	fi
+	@if [ "$(TORCH)" = cpu ]; then \
+		$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps \
+			--index-url https://download.pytorch.org/whl/cpu \
+			$$(sed -nE '/^torch(vision)?==/p' constraints.txt); \
 	fi
 	@echo "Installing the package and its development tools in $(VENV)"
 	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'

@@ -12,6 +12,7 @@ import os
 import re
 import shlex
 import subprocess
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields
 from datetime import date
@@ -37,7 +38,7 @@ def commit() -> str:
 
 
 @dataclass(kw_only=True)
-class Bench:
+class Bench(ABC):
     """Options of every benchmark."""
 
     output: Path = Path("docs/results")
@@ -55,8 +56,9 @@ class Bench:
         check_options(self, counts, "--")
         self.run()
 
+    @abstractmethod
     def run(self) -> None:
-        raise NotImplementedError
+        """Measures, and writes the table."""
 
     @property
     def cores(self) -> int:

@@ -14,7 +14,7 @@ from mmpi_ns.training import step_graph
 from mmpi_ns.training.step_graph import MEASURED, StepGraphs
 
 STEPS = 16
-MOST_NODES = 560
+MOST_NODES = 700
 """Kernels of a recorded half of a step at most: 13 heads' worth of networks would be more."""
 
 
