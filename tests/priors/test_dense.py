@@ -12,41 +12,11 @@ from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
 from mmpi_priors import dense
-from mmpi_priors.dense import Depth, confirmed, find_depths, without_fringes
+from mmpi_priors.dense import Depth, confirmed, find_depths
 from mmpi_priors.ops.matches import average_matches
-from mmpi_priors.views import camera_matrix, load_view, look_up, project
+from mmpi_priors.views import camera_matrix, load_view, project
 
 F32 = np.float32
-
-
-def values_at(image, x, y, nearest):
-    """Oracle of ``look_up`` for a list of places, float64: what is nearest, or interpolated within the borders."""
-    x, y, image = np.float32(x) - 0.5, np.float32(y) - 0.5, image.astype(np.float64)
-    height, width = image.shape[:2]
-    if nearest:
-        c, r = np.rint(x).astype(int), np.rint(y).astype(int)
-        inside = (c >= 0) & (c < width) & (r >= 0) & (r < height)
-        return np.where(inside, image[r.clip(0, height - 1), c.clip(0, width - 1)].T, 0).T
-    x, y = x.clip(0, width - 1), y.clip(0, height - 1)
-    c, r = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
-    u, v = (x - c, y - r) if image.ndim == 2 else ((x - c)[:, None], (y - r)[:, None])
-    upper, lower = ((1 - u) * image[k, c] + u * image[k, c + 1] for k in (r, r + 1))
-    return (1 - v) * upper + v * lower
-
-
-@pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3), (3, 70_000), (50_000, 2, 3), (2, 32_767), (8193, 3)])
-@pytest.mark.parametrize("nearest", [True, False])
-def test_images_and_lists_of_any_size_are_looked_up(shape, nearest):
-    rng = np.random.default_rng(0)
-    image = rng.random(shape).astype(F32)
-    x, y = rng.uniform(-3, shape[1] + 3, 100_000), rng.uniform(-3, shape[0] + 3, 100_000)
-    x[:9], y[:9] = [-1e4, 1e6, -1e6, 0, 0.5, shape[1], shape[1] - 0.5, 8192.5, 8192.2], 1.5
-    expected = values_at(image, x, y, nearest)
-    step = 0 if nearest else 1 / 32  # OpenCV rounds places to this much of a pixel
-    assert np.abs(look_up(image, x, y, nearest=nearest) - expected).max() <= step + 1e-6
-    folded = look_up(image, x.reshape(250, 400), y.reshape(250, 400), nearest=nearest)
-    assert np.abs(folded.reshape(expected.shape) - expected).max() <= step + 1e-6
-    assert look_up(image, x[:0], y[:0], nearest=nearest).shape == (0, *shape[2:])
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
@@ -145,27 +115,9 @@ def test_measurements_that_agree_are_averaged_by_certainty():
     assert error == pytest.approx(np.sqrt(1 / 5e4))
 
 
-def test_an_error_is_never_less_than_the_scatter_says():
-    """Errors of 0.01 each, values 0.03 apart: they agree (2.5 of sqrt 2 times 0.01), and scatter by 4.5 variances."""
-    assert mean_of((1.0, 1.03), (1e4, 1e4))[1] == pytest.approx(np.sqrt(4.5 / 2e4), rel=1e-4)
-
-
 def flat_view(tmp_path, pose, gray=128):
     view = load_view(scene_of(tmp_path, [pose]), 0, WIDTH)
     return replace(view, gray=np.full_like(view.gray, gray))
-
-
-def test_the_fringe_of_a_foreground_goes_where_it_has_no_texture_of_its_own(tmp_path):
-    view = flat_view(tmp_path, POSES[0])
-    inverse = np.full(view.gray.shape, 0.1, F32)
-    inverse[:, 100:] = 0.5
-    depth = Depth(inverse, 0.001 * inverse)
-    kept = without_fringes(view, depth).inverse > 0
-    half = dense.EDGE // 2
-    assert kept[:, :100].all() and not kept[:, 100 : 100 + half].any() and kept[:, 100 + half :].all()
-    rng = np.random.default_rng(0)
-    textured = replace(view, gray=rng.integers(0, 255, view.gray.shape, dtype=np.uint8))
-    assert (without_fringes(textured, depth).inverse > 0).mean() > 0.99
 
 
 def test_a_depth_counts_where_another_image_confirms_it_and_no_more_see_through_it(tmp_path):

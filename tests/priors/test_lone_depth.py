@@ -77,19 +77,6 @@ def test_nothing_known_or_everything_known_adds_nothing():
     assert not continued(seen(plane((0, 0, -1), 5, d), np.ones((HEIGHT, WIDTH), bool)), d).any()
 
 
-def test_the_trusted_of_two_surfaces_is_continued():
-    """A near wall known badly over a far one known well: the far one goes on."""
-    d, rng = directions(), np.random.default_rng(2)
-    far, near = plane((0, 0, -1), 10, d), plane((0, 0, -1), 9, d)
-    bad = rng.random((HEIGHT, WIDTH)) < 0.5
-    known = seen(far, middle())
-    known[bad] = seen(near, middle(), error=0.5)[bad]
-    found = continued(known, d)
-    added = found[..., 0] > 0
-    assert added.any()
-    assert np.abs(found[added][:, 0] / far[added] - 1).max() < 0.01
-
-
 def posed(*places, lens=(0.0, 0.0, 0.0, 0.0)):
     """Cameras that look along -z from these places."""
     poses = np.tile(np.eye(4)[:3], (len(places), 1, 1))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +10,6 @@ import pytest
 from training_runs import datamanager
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_priors import moving
 from mmpi_priors.dense import Depth
 from mmpi_priors.moving import gain_of, in_image
 from mmpi_priors.moving_evidence import Evidence, Neighbour, Shot, ground_of
@@ -70,18 +67,6 @@ def test_masks_of_the_user_win_and_the_option_leaves_all_pixels(drive, manager):
     kept = datamanager(drive, mask_moving=False)
     assert not kept.train_dataset.has_masks
     assert kept.priors.depths.share > manager.priors.depths.share
-
-
-def test_what_moves_is_told_and_drawn(manager, tmp_path):
-    dataset, path = manager.train_dataset, tmp_path / "report" / "moving.jpg"
-    assert re.fullmatch(r".* % of the training pixels, in \d of 8 images, show .*", manager.priors.movers)
-    moving.draw_moving(path, [Path(file) for file in dataset.image_filenames], dataset.moving)
-    picture = cv2.imread(str(path))
-    assert picture.shape == (2 * 180, 4 * 320, 3)
-    original = cv2.imread(str(dataset.image_filenames[0]))
-    redder = picture[:180, :320, 2].astype(int) - original[..., 2] > 30
-    mask = dataset.moving[0]
-    assert redder[mask].mean() > 0.5 and redder[~mask].mean() < 0.02
 
 
 def a_view(shift=0.0, gray=None) -> View:

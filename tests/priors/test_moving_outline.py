@@ -56,14 +56,6 @@ def test_another_thing_that_nothing_explains_does_not_join():
     assert not shown[48:].any() and shown[26:34, 50:56].mean() > 0.8 and not shown[:, 50 + AROUND + 2 :].any()
 
 
-def test_what_is_explained_amid_something_that_moves_stays():
-    shot, others = a_scene()
-    hole = np.s_[25:35, 33:44]
-    shot.color[hole] = a_shot(0.0, np.ascontiguousarray(textured(0, (60, 120))[:, 10:90]), 0.5).color[hole]
-    mask, core = in_box(HALO), in_box(np.s_[30:34, 46:49])
-    assert outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)[hole].all()
-
-
 def test_what_moves_in_a_neighbour_explains_nothing():
     shot, others = a_scene()
     nothing, everything = np.zeros(SIZE, bool), np.ones(SIZE, bool)

@@ -126,12 +126,6 @@ def test_a_depth_that_the_other_image_contradicts_is_no_point():
     assert not (points.pixels[:, 0] == 0).any() and not (points.other == 0).any() and len(points.other) > 100
 
 
-def test_an_uncertain_or_unknown_depth_is_no_point():
-    assert find(exact_depths(0.05)) is None
-    assert find(DepthPriors([packed(np.zeros_like(exact_depths().image(i))) for i in range(6)])) is None
-    assert find(images=[2]) is None, "one image has nobody to share with"
-
-
 def test_masks_and_transparent_pixels_are_left_out():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, : WIDTH // 2] = 0

@@ -181,23 +181,6 @@ def test_the_true_plane_is_alike_and_others_are_not():
     assert true.alike[inner].median() > 0.95 and (true.alike >= false.alike)[inner].float().mean() > 0.9
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_changed_planes_are_judged_as_what_they_are(seed):
-    """Whatever becomes of random planes, their correlations are those of the oracle, and no less than before."""
-    scene = random_scene(2, seed)
-    gray, others = operands(*scene)
-    rng = np.random.default_rng(seed)
-    planes = floats(rng.normal(size=(HEIGHT, WIDTH, 3)) * [0.2, 0.01, 0.01] + [0.4, 0, 0])[0]
-    before = compare_planes(gray, nothing(planes), planes, others, STRIDE)
-    changes = floats(rng.uniform(-0.5, 0.5, (HEIGHT, WIDTH, 4)))[0]
-    after = spread_planes(gray, before, changes, *floats(PINHOLE), others, STRIDE, 1)
-    assert (after.alike >= before.alike).all() and (after.alike > before.alike).float().mean() > 0.3
-    for r, c in np.ndindex(HEIGHT, WIDTH):
-        expected = alike(*scene, r, c, after.planes[r, c].double().numpy())
-        if not np.isnan(expected) and expected > -1:
-            assert float(after.alike[r, c]) == pytest.approx(expected, abs=3e-3)
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38, -1e38, 0.0])
 def test_planes_that_are_none_are_never_taken(value):
     scene, planes = slanted_wall()

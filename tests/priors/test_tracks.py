@@ -12,7 +12,7 @@ from value_noise import noise
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors.observe import with_tracks
-from mmpi_priors.tracks import NEIGHBOURS, near_pairs, triangulate
+from mmpi_priors.tracks import triangulate
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 180.0
 LENS = (0.05, -0.02, 0.001, -0.002)
@@ -110,11 +110,6 @@ def test_points_lie_on_the_walls(model):
     assert is_near_wall(model.points[near]).mean() > 0.97
 
 
-def test_ignoring_the_lens_would_misplace_the_points(images, model):
-    pinhole = triangulate(replace(images, distortion=np.zeros_like(images.distortion)))
-    assert np.median(depth_error(model.points)) < 0.5 * np.median(depth_error(pinhole.points))
-
-
 def test_a_fisheye_lens_is_taken_for_what_it_is(tmp_path):
     images = scene_of(tmp_path, POSES, (0.08, -0.03, 0.02, 0.01), fisheye=True)
     points = triangulate(images).points
@@ -157,26 +152,8 @@ def test_disturbed_poses_show_in_the_matches_and_exact_ones_do_not(images, model
     assert off is not None and 0.6 < off * WIDTH < 2
 
 
-def test_files_of_one_name_in_several_folders_stay_apart(tmp_path, model):
-    moved = scene_of(tmp_path, POSES, LENS)
-    files = []
-    for i, file in enumerate(moved.files):
-        (tmp_path / str(i)).mkdir()
-        files.append(file.rename(tmp_path / str(i) / "same.png"))
-    found = triangulate(replace(moved, files=tuple(files)))
-    assert np.array_equal(found.points, model.points)
-
-
 def test_an_unreadable_image_is_named(tmp_path):
     images = scene_of(tmp_path, POSES[:2])
     images.files[1].write_text("not an image")
     with pytest.raises(ValueError, match=r"view1\.png cannot be read"):
         triangulate(images)
-
-
-def test_pairs_are_near_and_look_the_same_way():
-    pairs = near_pairs(np.stack([pose_at(float(i)) for i in range(60)]), NEIGHBOURS)
-    assert all(abs(i - j) <= NEIGHBOURS for i, j in pairs)
-    assert all((i, i + 1) in pairs for i in range(59))
-    around = np.stack([pose_at(0.0, np.radians(45.0 * i)) for i in range(8)])
-    assert near_pairs(around, NEIGHBOURS) == sorted({tuple(sorted((i, (i + 1) % 8))) for i in range(8)})
