@@ -10,7 +10,6 @@ import pytest
 from hand_made import make_mpi
 
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
-from mmpi_ns.scene.windows import WindowedPlan
 
 
 def refused(**changes):
@@ -50,17 +49,6 @@ def test_far_end_is_a_number_or_null_in_json_and_may_be_left_out():
     assert [m.far for m in ScenePlan.from_json(json.dumps(data)).mpis] == [math.inf, math.inf]
 
 
-def test_plan_is_loaded_from_a_file(plan, tmp_path):
-    path = tmp_path / "plan.json"
-    path.write_text(plan.to_json(), encoding="utf-8")
-    assert WindowedPlan.load(path).plans[0] == plan
-
-
-def test_missing_plan_file_names_the_path_and_the_option(tmp_path):
-    with pytest.raises(ValueError, match=r"nowhere\.json.*plan-file"):
-        WindowedPlan.load(tmp_path / "nowhere.json")
-
-
 def test_heads_are_the_mpis_and_then_the_cube(plan):
     assert plan.names == ("front", "left", "cube") and plan.num_heads == 3
     assert replace(plan, cube=None).names == ("front", "left")
@@ -71,23 +59,15 @@ def test_heads_are_the_mpis_and_then_the_cube(plan):
     ("changes", "words"),
     [
         ({"near": 0.0}, "near"),
-        ({"near": -1.0}, "near"),
         ({"near": math.nan}, "finite"),
         ({"origin": (0.0, math.inf, 0.0)}, "finite"),
         ({"extent": (1.0, -1.0, -1.0, 1.0)}, "extent"),
-        ({"extent": (-1.0, 1.0, 0.5, 0.5)}, "extent"),
-        ({"extent": (-1.0, math.nan, -0.5, 0.5)}, "finite"),
         ({"axes": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 2.0))}, "axes"),
-        ({"axes": ((1.0, 0.0, 0.0), (0.6, 0.8, 0.0), (0.0, 0.0, 1.0))}, "axes"),
-        ({"axes": ((1.0, 0.0, 0.0), (0.0, math.nan, 0.0), (0.0, 0.0, 1.0))}, "finite"),
         ({"axes": ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))}, "axes"),  # left-handed
         ({"planes": 1}, "planes"),
         ({"height": 1}, "texels"),
-        ({"width": 0}, "texels"),
         ({"far": 1.0}, "far"),
-        ({"far": 0.5}, "far"),
         ({"far": math.nan}, "far"),
-        ({"far": -math.inf}, "far"),
     ],
 )
 def test_unusable_mpis_are_refused_by_name_and_field(changes, words):
@@ -100,13 +80,8 @@ def test_scene_plans_without_mpis_or_with_impossible_distances_are_refused(plan)
     messages = [
         (refused_scene(plan, mpis=()), "mpis"),
         (refused_scene(plan, ray_near=-0.1), "ray_near"),
-        (refused_scene(plan, ray_near=math.inf), "ray_near"),
-        (refused_scene(plan, ray_near=math.nan), "ray_near"),
         (refused_scene(plan, content_near=-1.0), "content_near"),
-        (refused_scene(plan, content_near=math.nan), "content_near"),
-        (refused_scene(plan, content_near=math.inf), "content_near"),
         (refused_scene(plan, cube=replace(plan.cube, upper=plan.cube.lower)), "cube"),
-        (refused_scene(plan, cube=replace(plan.cube, lower=(math.nan, 0.0, 0.0))), "cube"),
         (refused_scene(plan, cube=replace(plan.cube, shape=(7, 1, 5))), "cube"),
     ]
     for message, word in messages:
@@ -121,11 +96,6 @@ def test_fields_of_the_wrong_form_name_the_mpi(plan, field, value):
     data["mpis"][1][field] = value
     with pytest.raises(ValueError, match=rf"left.*{field}|{field}.*left"):
         ScenePlan.from_json(json.dumps(data))
-
-
-def test_text_that_is_not_json_is_called_so():
-    with pytest.raises(ValueError, match="not valid JSON"):
-        ScenePlan.from_json("{ origin: 3 ")
 
 
 def test_scaled_plan_has_that_share_of_the_texels_and_the_same_frames():
