@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import resource
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,13 +65,6 @@ def test_one_place_can_be_trained_on_request_and_says_what_it_cannot_learn(data,
     trainer.train()
     assert len(trainer.pipeline.model.field.full_plan.mpis) == 1
     assert all(torch.isfinite(p).all() for p in trainer.pipeline.model.parameters())
-
-
-def test_without_test_images_training_images_are_scored_and_it_says_so(data, capsys):
-    edit(data, keep_one)
-    manager = datamanager(data, dataparser=NerfstudioDataParserConfig(auto_scale_poses=False))
-    assert manager.eval_dataset.image_filenames == manager.train_dataset.image_filenames
-    assert "no test images" in " ".join(capsys.readouterr().out.split())
 
 
 # Images and masks ----------------------------------------------------------------------------------------------------
@@ -148,47 +136,7 @@ def test_placement_refuses_points_behind_every_camera(scene):
 # Crops ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def trained(scene, plan_file, tmp_path_factory):
-    """A short run with a checkpoint."""
-    trainer = ready(trainer_config(scene, plan_file, tmp_path_factory.mktemp("run"), 6))
-    trainer.train()
-    return trainer
-
-
 # Checkpoints ---------------------------------------------------------------------------------------------------------
-
-
-def contents(folder):
-    return {p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-def test_a_disk_that_is_full_while_saving_leaves_the_last_checkpoint(trained, scene, plan_file, tmp_path):
-    trainer = ready(trainer_config(scene, plan_file, tmp_path, 6))
-    trainer.config.save_only_latest_checkpoint = True
-    trainer.save_checkpoint(2)
-    before = contents(trainer.base_dir)
-    size = trainer.checkpoint_dir.joinpath("step-000000002.ckpt").stat().st_size
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, limits[1]))  # the real writer fails half way through
-    try:
-        for step in (2, 3):
-            words = (f"step-{step:09d}.ckpt could not be written", "MB free", "make room")
-            refusal(lambda step=step: trainer.save_checkpoint(step), *words, error=OSError)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert contents(trainer.base_dir) == before
-    again = ready(trainer_config(scene, plan_file, tmp_path / "again", 6), load_dir=trainer.checkpoint_dir)
-    assert again._start_step == 3
-
-
-def test_a_checkpoint_cut_short_is_named(trained, scene, plan_file, tmp_path):
-    folder = tmp_path / "models"
-    folder.mkdir()
-    whole = (trained.checkpoint_dir / "step-000000005.ckpt").read_bytes()
-    (folder / "step-000000005.ckpt").write_bytes(whole[: len(whole) // 2])
-    config = trainer_config(scene, plan_file, tmp_path / "out", 6)
-    refusal(lambda: ready(config, load_dir=folder), folder / "step-000000005.ckpt", "cannot be read", "--load-step")
 
 
 # Devices, and the command as a whole ---------------------------------------------------------------------------------
@@ -200,15 +148,3 @@ def test_a_gpu_asked_for_where_there_is_none(scene, plan_file, tmp_path):
     config.machine.device_type = "cuda"
     refusal(config.save_config, "--machine.device-type cuda", "torch sees none", "--machine.device-type cpu")
     assert not list(tmp_path.iterdir()), "before anything is written"
-
-
-def test_the_command_ends_with_the_sentence_and_status_1(data, tmp_path):
-    edit(data, lambda meta: meta["frames"][3].pop("transform_matrix"))
-    done = subprocess.run(
-        [str(Path(sys.executable).with_name("ns-train")), "mmpi-small", "--data", str(data), "--output-dir",
-         str(tmp_path / "out"), "--machine.device-type", "cpu", "--vis", "tensorboard"],
-        capture_output=True, text=True, timeout=200, env=os.environ | {"COLUMNS": "200"},
-    )  # fmt: skip
-    last = done.stderr.strip().splitlines()[-1]
-    assert done.returncode == 1 and last.startswith("mmpi_ns.utils.errors.InputError: Frame")
-    assert name_of(3) in last and last.endswith("remove the frame.")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import math
+import os
 import subprocess
 from pathlib import Path
 
@@ -24,15 +24,6 @@ def operations():
         for path in Path(str(importlib.import_module(ops).__file__)).parent.glob("*/__init__.py"):
             importlib.import_module(f"{ops}.{path.parent.name}")
     return dispatch.OPERATIONS
-
-
-def test_every_form_of_an_operation_has_its_signature(operations):
-    for name, operation in operations.items():
-        for form in operation.compiled:
-            if form == "gpu" and importlib.util.find_spec("triton") is None:
-                continue
-            parameters = list(inspect.signature(dispatch.function(name, form)).parameters)
-            assert parameters == list(operation.signature.parameters), (name, form)
 
 
 def test_every_operation_with_a_gpu_form_has_cases(operations):
@@ -74,9 +65,9 @@ def test_a_compiler_that_fails_is_named(monkeypatch, unbuilt, capsys):
     assert not list(unbuilt.glob("mmpi_ns/*.so"))
 
 
-def test_what_was_compiled_is_used_again(monkeypatch, unbuilt):
+def test_what_was_compiled_is_used_again(monkeypatch):
     assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
-    assert [p.suffix for p in (unbuilt / "mmpi_ns").iterdir()] == [".so"]
+    assert list(Path(os.environ["XDG_CACHE_HOME"], "mmpi_ns").glob("kernels-*.so"))
     build.library.cache_clear()
     dispatch.fault.cache_clear()
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: pytest.fail("compiled twice"))

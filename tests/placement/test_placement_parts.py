@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import re
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from seen_points import FX, FY, HEIGHT, WIDTH, mpi, observed, turned_about_y
 
 from mmpi_ns.placement.candidates import Candidate, find_candidates
-from mmpi_ns.placement.errors import PixelErrors, cube_errors, mpi_errors
+from mmpi_ns.placement.errors import mpi_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
-from mmpi_ns.placement.rule import PlacementConfig, _Choice, place
-from mmpi_ns.scene.plan import CubePlan
 
 
 def test_content_starts_for_each_camera_where_its_own_points_do():
@@ -72,57 +66,11 @@ def test_a_candidates_errors_are_those_of_the_mpi_made_of_it():
     assert seen > 50
 
 
-def test_a_cubes_error_is_the_longest_side_of_a_voxel_at_the_points_depth():
-    observations = observed([[0.0, 0, 4]])
-    cube = CubePlan((-1.0, -2.0, -3.0), (1.0, 2.0, 3.0), (10, 40, 20))  # z, y, x: voxels of 0.1, 0.1, 0.6
-    points = np.array([[0.5, 1.5, -1.0], [0.5, 1.5, 2.0], [0.5, 2.1, 2.0]])
-    found = cube_errors(cube, observations, np.zeros(3, np.int64), points)
-    assert found == pytest.approx([0.6 * FX / 5, 0.6 * FX / 2, np.inf])
-
-
-def test_both_errors_count_as_one_and_the_smallest_decides_which_head_serves_best():
-    inf = math.inf
-    errors = PixelErrors(
-        np.array([[3.0, 0.0], [9.0, 4.0], [inf, 1.0], [inf, inf]]),
-        np.array([[8.0, 12.0], [0.0, 6.0], [inf, 2.0], [inf, inf]]),
-    )
-    assert errors.combined[:2] == pytest.approx(np.array([[5, 6], [9, 5]]))
-    assert errors.combined[:3].argmin(-1).tolist() == [0, 1, 1]
-
-
-# The choice, among candidates made by hand ---------------------------------------------------------------------------
-
-
 def candidate(texel, plane=None, rows=100.0, frame=None) -> Candidate:
     """What it costs each observation: pixels of a texel, and of two planes."""
     texel = np.asarray(texel, np.float32)
     plane = np.zeros(len(texel), np.float32) if plane is None else np.asarray(plane, np.float32)
     return Candidate(frame or mpi(), rows, rows, plane, texel)
-
-
-def chosen(candidates, weight=10.0, **changes):
-    """The heads, with texels of two pixels, planes for one pixel, and so much weight for every observation."""
-    config = PlacementConfig(plane_pixels=0.5, texel_pixels=2.0, **changes)
-    return _Choice(candidates, np.full(len(candidates[0].texel), weight), config, 2.0).heads(2.0)
-
-
-def marked(number):
-    return mpi(name=str(number))
-
-
-def test_planes_are_as_many_as_four_fifths_of_what_is_served_ask_for():
-    error = np.random.default_rng(0).permutation(np.arange(101.0))  # 80 at four fifths, one pixel is allowed
-    assert chosen([candidate(np.ones(101), error)])[0].planes == 80
-    assert chosen([candidate(np.ones(101), 20 * error)])[0].planes == PlacementConfig().max_planes
-    assert chosen([candidate(np.ones(101), 0.01 * error)])[0].planes == 16
-    assert chosen([candidate(np.ones(101), 20 * error)], max_planes=64)[0].planes == 64
-
-
-def side_by_side(count: int, depths=(-10.0,)) -> Observations:
-    """Cameras within a millimetre of each other that see the same points, or as far apart that none shares any."""
-    points = np.array([[0.01 * x, 0.01 * y, z] for z in depths for x in range(5) for y in range(5)])
-    centers = [[0.001 * i, 0, 0] for i in range(count)]
-    return observed(centers, np.tile(points, (count, 1)), np.arange(count).repeat(len(points)))
 
 
 def test_pixels_that_see_a_pixels_content_are_those_of_all_images_by_their_magnification():
@@ -148,31 +96,3 @@ def test_pixels_that_see_a_pixels_content_are_those_of_all_images_by_their_magni
     share = np.cumsum(visible.weights[order]) / visible.weights.sum()
     assert pixels_per_pixel(observations, visible) == pytest.approx(max(1, covered[order[(share >= 0.25).argmax()]]))
     assert 1.2 < pixels_per_pixel(observations, visible) < 7
-
-
-@pytest.mark.parametrize(
-    ("changes", "rays", "words"),
-    [
-        ({}, 10**9, "2.0 pixels: finer with a smaller placement.texel-pixels"),
-        ({}, 2000, " pixels: finer with more steps"),
-        ({"max_texels": 2e4}, 10**9, " pixels: finer with a larger placement.max-texels"),
-    ],
-)
-def test_a_plan_says_how_large_texels_are_and_what_makes_them_finer(changes, rays, words):
-    config = replace(PlacementConfig(texel_pixels=2.0, max_texels=0), **changes)
-    plan = place(side_by_side(4), config, rays)
-    assert plan.origin_of_plan.startswith("automatic placement, a texel spans ") and words in plan.origin_of_plan
-    numbers = [float(n) for n in re.findall(r"(?:spans|down to) ([\d.]+)", plan.origin_of_plan)]
-    assert plan.detail == pytest.approx((numbers[0] / numbers[-1]) ** 2, rel=0.1) and numbers[-1] >= 2.0
-    assert (plan.detail > 1) == (len(numbers) == 2) == ("max_texels" in changes)
-
-
-def test_a_short_training_gets_a_small_plan():
-    random = np.random.default_rng(0)
-    points = random.uniform([-8, -4, -40], [8, 4, -6], (300, 3))
-    cameras = observed(
-        [[x, y, 0] for x in range(3) for y in range(3)], np.tile(points, (9, 1)), np.arange(9).repeat(300)
-    )
-    config = PlacementConfig(rays_per_texel=0)
-    texels = {rays: place(cameras, config, rays).texels for rays in (2_000, 20_000, None)}
-    assert 12_000 < texels[2_000] <= 16_000 and 120_000 < texels[20_000] <= 160_000 < texels[None]

@@ -9,7 +9,7 @@ import pytest
 from seen_points import FX, FY, HEIGHT, WIDTH, mpi, observed
 
 from mmpi_ns.placement.observations import find_visible_points
-from mmpi_ns.placement.rule import PlacementConfig, place, widened
+from mmpi_ns.placement.rule import widened
 
 
 def test_a_border_goes_to_the_mpi_that_must_grow_least_and_texels_keep_their_size_both_ways():
@@ -23,11 +23,3 @@ def test_a_border_goes_to_the_mpi_that_must_grow_least_and_texels_keep_their_siz
     far = replace(close, near=11.0)  # begins behind the content, so it holds none of it
     got = widened([narrow, far], observations, find_visible_points(observations))
     assert got[1] == far and got[0].extent == pytest.approx([1.1 * x for x in whole])
-
-
-@pytest.mark.parametrize("arrangement", ["room", "drive"])
-def test_hand_made_mpis_have_the_rows_and_columns_that_are_asked_for(arrangement):
-    points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) - [0, 0, 8.0]
-    cameras = observed([[0.0, 0, 0], [1, 0, 0]], points, np.repeat([0, 1], 25))
-    plan = place(cameras, PlacementConfig(arrangement=arrangement, planes=5, height=8, width=12))
-    assert {(m.planes, m.height, m.width) for m in plan.mpis} == {(5, 8, 12)}

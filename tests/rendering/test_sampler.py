@@ -13,8 +13,6 @@ from random_fields import bundle, compare, fill, random_field, random_rays, rend
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.rendering.rendered import render_rays
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 
@@ -195,22 +193,3 @@ def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
     assert count < 0.8 * (sum(looked_up) - count), "nothing was stopped"
     assert (stopped.rgb - whole.rgb).abs().max() < 1e-4
     assert (stopped.composite.accumulation - whole.composite.accumulation).abs().max() < 1e-4
-
-
-def test_ray_samples_hold_what_the_field_needs():
-    field = random_field(4, True, seed=18)
-    found = render(field, bundle(*random_rays(field.plan, 9, seed=19)), blends=True).samples
-    valid, inverse_t = found.valid, found.inverse_t
-    rays, width = valid.shape
-    assert rays == 9 and width == valid.sum(1).max() and found.ndc.shape == (9, width, 3)
-    for name in ("heads", "planes", "inverse_t", "skipped_before", "tau"):
-        assert getattr(found, name).shape == valid.shape
-    assert valid.dtype == torch.bool and (valid[:, :-1] | ~valid[:, 1:]).all(), "samples are packed to the left"
-    assert (inverse_t[:, :-1] >= inverse_t[:, 1:]).all() and (inverse_t[~valid] == 0).all()
-    assert (found.ndc[valid].abs() <= 1 + 1e-5).all()
-
-
-def test_the_sampler_builds_no_graph():
-    field = random_field(2, True, seed=20).train()
-    samples = render_rays(bundle(*random_rays(field.plan, 4, seed=21)), field, MarchOptions(0.0, blends=True)).samples
-    assert not any(t.requires_grad for t in vars(samples).values() if isinstance(t, torch.Tensor))

@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -18,11 +17,8 @@ from mmpi_ns.field.shading import RayShader
 from mmpi_ns.rendering.rendered import bounded, shown_outputs, winners
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_show import __main__ as export
-from mmpi_show import bake as bake_module
-from mmpi_show import windows as baking
 from mmpi_show.bake import bake_of_model, bake_run, compare
 from mmpi_show.files import read_baked, write_baked
-from mmpi_show.scene import brick_numbers
 
 
 @pytest.fixture(scope="module")
@@ -136,17 +132,6 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
     assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
 
 
-def test_codes_are_off_where_training_views_see_little_of_them(trainer, monkeypatch):
-    filled(trainer)
-    smooth, seen = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis, []
-    monkeypatch.setattr(bake_module, "smoothed", lambda window, peaks: seen.append(peaks) or window)
-    exact = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis
-    for i, codes in enumerate(exact.channel_codes):
-        off = codes.step * (smooth.texels[..., i].int() - exact.texels[..., i].int()).abs()
-        assert (off * seen[0] <= bake_module.SLACK + 1e-6).all() and off.max() > 1
-    assert torch.equal(smooth.density, exact.density)
-
-
 def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
     model = filled(trainer)
     monkeypatch.setattr(model.field, "feature_channels", 17)
@@ -196,35 +181,3 @@ def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch, caps
     said = capsys.readouterr().err.strip()
     assert caught.value.code == 1 and said.startswith("mmpi-export: ") and words in said and "\n" not in said
     assert all(Path(name).read_text() == "{}" for name in files)
-
-
-def test_baked_codes_are_those_of_the_planes(trainer, monkeypatch, request):
-    """Bricks hold the codes of the whole planes, read texel by texel, and no tile with a code above 0 is missing."""
-    field, g = filled(trainer, 4).field, torch.Generator().manual_seed(2)
-    plan, factor = field.full_plan, field.factor
-    field.copy_finely((field.tiles > 0) & (torch.rand(len(field.tiles), generator=g) < 0.4))
-    request.addfinalizer(lambda: field.build(plan, factor))
-    field._keep(torch.rand(field.num_bricks + 1, generator=g) < 0.6)
-    field.density.data[64:][torch.rand(len(field.density) - 64, generator=g) < 0.3] = -20.0
-    monkeypatch.setattr(baking, "AT_ONCE_BRICKS", 7)
-    baked, seen = baking.bake(field, 3e-3, 0.5, False, (1.0, 1.0, 1.0)).mpis, 0
-    assert (field.tiles == 0).any() and baked.num_bricks > 50
-    for k, numbers in enumerate(brick_numbers(baked.columns, baked.mpis)):
-        grid = field.grids[k]
-        planes = field.density.data[grid.rows, 0].view(grid.depth, grid.height, grid.width)
-        codes = baked.density_codes.encode(planes + field.layout.biases[k][:, None, None])
-        features = field.features.data[grid.rows].view(grid.depth, grid.height, grid.width, -1)
-        stored = (grid.rows >= 64).view(grid.depth, grid.height, grid.width)
-        for (plane, row, column), number in zip(np.ndindex(numbers.shape), numbers.flatten().tolist(), strict=True):
-            place = plane, slice(7 * row, 7 * row + 8), slice(7 * column, 7 * column + 8)
-            shows = bool(stored[place].any()) and bool((codes[place] > 0).any())
-            assert (number >= 0) == shows
-            if number < 0:
-                continue
-            height, width = codes[place].shape
-            assert torch.equal(baked.density[number, :height, :width], codes[place])
-            for i, channel in enumerate(baked.channel_codes):
-                assert torch.equal(baked.texels[number, :height, :width, i], channel.encode(features[place][..., i]))
-            assert not baked.density[number, height:].any() and not baked.texels[number, :, width:].any()
-            seen += 1
-    assert seen == baked.num_bricks

@@ -5,15 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from random_bricks import random_window, rays_into, scene_of
 
-from mmpi_show import files
 from mmpi_show.details import StoredView
 from mmpi_show.files import HEADER, read_baked, write_baked
-from mmpi_show.ops.baked import reader
 
 
 @pytest.fixture
@@ -41,14 +38,6 @@ def test_what_is_written_is_read(folder):
         for layer, other_layer in zip(window.shader.layers, other.shader.layers, strict=True):
             for a, b in zip(layer, other_layer, strict=True):
                 assert torch.equal(a.half().float(), b)
-
-
-def test_the_reader_finds_the_same_codes(folder):
-    raw, scene = reader.read(folder), read_baked(folder)
-    for row, (_, window) in zip(raw["windows"], scene.windows, strict=True):
-        assert np.array_equal(row["density_array"], window.mpis.density.numpy().reshape(-1, 64))
-        texels = window.mpis.texels.numpy().reshape(-1, 64, len(row["channels"]))
-        assert np.array_equal(row["texels_array"], texels)
 
 
 def test_windows_are_mixed_by_their_shares():
@@ -98,19 +87,6 @@ def test_damage_is_one_sentence(folder):
     refused("damaged")
     (folder / HEADER).unlink()
     refused("no baked scene", "mmpi-export bake")
-
-
-def test_a_full_disk_leaves_no_header(folder, monkeypatch):
-    """Writing over an export that fails half way leaves nothing that looks whole."""
-
-    monkeypatch.setattr(files, "write_atomically", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        write_baked(scene_of(random_window()), folder)
-    assert not (folder / HEADER).is_file()
-
-
-def full_disk(path, write, folder=None):
-    raise OSError(28, "No space left on device", str(path))
 
 
 def test_what_comes_first_takes_a_tenth_of_the_bytes(tmp_path):

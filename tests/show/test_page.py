@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import shutil
 import time
@@ -85,20 +84,6 @@ def test_the_canvas_shows_what_we_render(opened, site):
         assert psnr(a, b) > CLOSE, (number, psnr(a, b))
 
 
-def test_windows_are_mixed(opened, site):
-    """Between two windows the page fetches both and mixes them as we do."""
-    scene = read_baked(site)
-    middle = np.add(scene.windows[0][0].center, (2.0, 0.0, 0.0))
-    opened.evaluate(f"mmpi.path[0].eye = {middle.tolist()}; mmpi.camera = structuredClone(mmpi.path[0]); mmpi.feed()")
-    opened.until("mmpi.windows.get(0)?.whole && mmpi.windows.get(1)?.whole")
-    pose = scene.path[0]
-    for row, value in zip(pose.to_world, middle, strict=True):
-        row[3] = float(value)
-    close = psnr(shown(opened, 0), ours(site, pose))
-    opened.evaluate("mmpi.press('r')")
-    assert close > CLOSE - 4  # each window's part is rounded to 8 bits
-
-
 def until(happened, wait=30):
     """Waits for what an event brings about: the page handles it when it comes to it."""
     end = time.monotonic() + wait
@@ -155,13 +140,6 @@ def test_keys_choose_what_is_shown(opened):
     assert np.array_equal(shown(opened, 1), colors)
 
 
-def test_resolution_follows_the_time_of_a_frame(opened):
-    """A camera that moves is drawn with fewer pixels where a frame costs too much, and sharply again at rest."""
-    opened.evaluate("mmpi.cost = 1e-4; mmpi.touched()")
-    small = opened.until("mmpi.drawn < 1 && mmpi.gl.canvas.width")
-    assert small < opened.evaluate("innerWidth")
-
-
 def test_the_console_stays_empty(opened):
     assert opened.messages == []
 
@@ -212,16 +190,6 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
             if number == len(windows) - 1:
                 assert not tab.evaluate("window.first.some((t) => mmpi.gl.isTexture(t)) || mmpi.windows.has(0)")
     assert tab.messages == []
-
-
-def halved(codes):
-    """Codes [B, 8, 8] with all but every second row and column replaced by means, texel by texel."""
-    codes = codes.to(torch.int64)
-    for y, x in [*itertools.product(range(0, 8, 2), range(1, 8, 2)), *itertools.product(range(1, 8, 2), range(8))]:
-        dy, dx = (0, 1) if y % 2 == 0 else (1, 0)
-        after = codes[:, y + dy, x + dx] if max(y + dy, x + dx) < 8 else codes[:, y - dy, x - dx]
-        codes[:, y, x] = (codes[:, y - dy, x - dx] + after) // 2
-    return codes.to(torch.uint8)
 
 
 @pytest.fixture(scope="module")

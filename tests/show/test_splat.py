@@ -76,12 +76,6 @@ def test_agrees_with_the_hand_made_renderer(seed):
     np.testing.assert_allclose(sums[:, 3], weights.sum((0, 1)), atol=0.03)
 
 
-def test_no_gaussians_show_nothing():
-    gaussians = Gaussians(torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0))
-    image = splat_image(gaussians, VIEW, torch.zeros(0, 3))
-    assert (image[..., :3] == 0).all() and (image[..., 3] == 1).all()
-
-
 def test_opacities_agree_with_finite_differences():
     """What the image changes with each opacity, as the hand-made renderer changes, shares out an error."""
     gaussians, colors = some(12, seed=5)

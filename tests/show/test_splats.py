@@ -107,42 +107,6 @@ def test_fitted_colours_come_closer_to_the_window(window):
     assert error(end, small) < 0.01
 
 
-def test_fitted_opacities_help(window, monkeypatch):
-    """Splats that are too faint come closer to the window with their opacities than with their colours alone."""
-    poses = cameras(window)
-    faint = splats.splats_of(window, poses, 0.01, 10_000, rounds=0)
-    faint = replace(faint, alphas=0.4 * faint.alphas)
-
-    def error(step):
-        monkeypatch.setattr(splats, "OPACITY_STEP", step)
-        found = faint
-        for _ in range(4):
-            found = splats.fitted(found, window, poses)
-        shown = [splat_image(found.gaussians, view_of(p), colors_from(found, eye_of(p))) for p in poses]
-        images = [x[..., :3] + window.background * x[..., 3:] for x in shown]
-        targets = [window.render(*p.rays())["rgb"] for p in poses]
-        return sum(float((a.reshape(-1, 3) - b).square().mean()) for a, b in zip(images, targets, strict=True))
-
-    assert error(splats.OPACITY_STEP) < 0.95 * error(0.0)
-
-
-def view_of(pose):
-    return View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-
-
 def colors_from(made, eye):
     """Colours of all splats, seen from a point."""
     return (made.basis(eye)[:, :, None] * made.colors).sum(1).clamp(0, 1)
-
-
-def eye_of(pose):
-    return torch.tensor(pose.to_world).float()[:, 3]
-
-
-def test_cameras_between_two_lie_between_them():
-    a = Pose([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], (4, 4), (4, 4), (2, 2))
-    b = replace(a, to_world=[[0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 0]])  # a quarter turn to the left
-    made, last = splats.between([a, b], 0.5)
-    half = 0.5**0.5
-    np.testing.assert_allclose(made.to_world, [[half, 0, half, 1], [0, 1, 0, 0], [-half, 0, half, 0]], atol=1e-9)
-    np.testing.assert_allclose(last.to_world, b.to_world, atol=1e-9)

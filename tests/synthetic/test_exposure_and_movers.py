@@ -11,7 +11,7 @@ from PIL import Image
 from mmpi_scene import make_scene, render, sfm_points
 from mmpi_scene.__main__ import SceneCommand
 from mmpi_scene.dataset import light_of, make_exposure
-from mmpi_scene.movers import MOVER, moving_mask, with_movers
+from mmpi_scene.movers import moving_mask, with_movers
 
 FRAMES = {"count": 16, "width": 96, "height": 54, "length": 12.0}
 
@@ -83,23 +83,9 @@ def test_masks_hold_all_that_movers_change_and_little_else(walk, busy):
     assert masked > 300 and changed > 0.85 * masked
 
 
-def test_test_images_show_the_street_without_movers(walk, busy, written):
-    number = int(np.flatnonzero(walk.cameras.is_test)[0])
-    assert np.array_equal(render(busy.filmed_by(number), number)[0], render(walk, number)[0])
-    assert not moving_mask(busy, number).any()
-    assert not np.asarray(Image.open(written / "moving" / f"frame_{number + 1:05d}.png")).any()
-
-
 def test_no_keypoint_lies_on_a_mover(busy):
     found = sfm_points(busy, 300, noise_pixels=0.0, outliers=0.0)
     for i in np.unique(found.camera):
         hit = busy.filmed_by(i).hit(*busy.cameras.rays(i, found.pixel[found.camera == i]))[1]
         if not busy.cameras.is_test[i]:
             assert not (busy.filmed_by(i).moving[hit] & (hit >= 0)).any()
-
-
-def test_exact_masks_are_beside_the_images_and_not_in_transforms_json(written):
-    meta = json.loads((written / "transforms.json").read_text())
-    assert not any("mask_path" in frame for frame in meta["frames"])
-    masks = [np.asarray(Image.open(p)) for p in sorted((written / "moving").iterdir())]
-    assert len(masks) == 16 and {0, MOVER} <= set(np.unique(masks).tolist()) <= {0, 128, 255}

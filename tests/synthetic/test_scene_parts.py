@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import pycolmap
 import pytest
-from procedural import keypoint_errors
 
-from mmpi_scene import Scene, make_scene, sfm_points, write_dataset
+from mmpi_scene import Scene, make_scene
 from mmpi_scene.primitives import BOX, SPHERE
 
 
@@ -55,37 +51,3 @@ def test_first_hits_are_those_of_a_slow_search_through_every_solid(name):
     hit = np.isfinite(wanted)
     assert np.allclose(distance[hit], wanted[hit], rtol=1e-9)
     assert np.allclose(every[row[hit], np.flatnonzero(hit)], wanted[hit], rtol=1e-9) and (row[~hit] == -1).all()
-
-
-def test_tracks_are_near_enough_and_have_the_colours_that_cameras_see(street):
-    scene = replace(street, track_range=14.0)
-    found = sfm_points(scene, 300, noise_pixels=0.0, outliers=0.0)
-    eyes = scene.cameras.camera_to_worlds[found.camera, :, 3]
-    rays = found.true_points[found.point] - eyes
-    away = np.linalg.norm(rays, axis=-1, keepdims=True)
-    assert len(found.points) > 200 and 12 < away.max() < 14
-    first = np.searchsorted(found.point, np.arange(len(found.points)))
-    seen = scene.trace(eyes[first], (rays / away)[first], 1 / scene.cameras.focal)[1]
-    # Textures are finer or coarser by distance, so single points differ.
-    assert np.median(np.abs(found.colors / 255 - seen).max(-1)) < 0.03
-    warmth = [c[:, 0] - c[:, 2] for c in (found.colors / 255, seen)]
-    assert np.corrcoef(*warmth)[0, 1] > 0.9
-
-
-def test_files_hold_the_points_their_colours_and_tracks(street, tmp_path):
-    found = write_dataset(street, tmp_path / "out", points=120, images=False)
-    head, _, body = (tmp_path / "out/sparse_pc.ply").read_bytes().partition(b"end_header\n")
-    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property")]
-    assert names == ["x", "y", "z", "red", "green", "blue"]
-    table = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    order = np.lexsort(table["xyz"].T), np.lexsort(found.points.astype(np.float32).T)
-    assert np.allclose(table["xyz"][order[0]], found.points[order[1]], rtol=1e-6)
-    assert np.array_equal(table["rgb"][order[0]], found.colors[order[1]])
-    model = pycolmap.Reconstruction(str(tmp_path / "out/colmap/sparse/0"))
-    for p in range(120):
-        point = model.points3D[p + 1]
-        assert np.allclose(point.xyz, found.points[p]) and (point.color == found.colors[p]).all()
-        own = found.point == p
-        track = [(e.image_id - 1, *model.images[e.image_id].points2D[e.point2D_idx].xy) for e in point.track.elements]
-        assert np.allclose(track, np.column_stack([found.camera[own], found.pixel[own]]), atol=1e-4)
-        assert point.error == pytest.approx(keypoint_errors(street, found)[own].mean(), abs=1e-4)

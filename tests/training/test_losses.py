@@ -82,35 +82,6 @@ def test_background_entropy_is_largest_for_a_coin_flip_and_nothing_for_a_decisio
     assert losses.background_entropy(tensor([[0.0], [1.0]])).item() < 2e-5
 
 
-def test_distortion_of_two_samples_by_hand():
-    weights, positions, intervals = tensor([[0.6, 0.2]]), tensor([[0.1, 0.5]]), tensor([0.03])
-    expected = 2 * 0.6 * 0.2 * 0.4 + (0.36 + 0.04) * 0.03 / 3
-    assert distortion(weights, positions, intervals).item() == pytest.approx(expected)
-
-
-def distortion_pairwise(weights, positions, intervals):
-    """Every pair of samples, as in mip-NeRF 360 eq. (15)."""
-    total = 0.0
-    for w, s, delta in zip(weights.tolist(), positions.tolist(), intervals.tolist(), strict=True):
-        for i in range(len(w)):
-            for j in range(len(w)):
-                total += w[i] * w[j] * abs(s[i] - s[j])
-            total += w[i] ** 2 * delta / 3
-    return total / len(weights)
-
-
-@pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 1e-5), (F64, 1e-12)])
-def test_distortion_equals_the_double_loop(dtype, error):
-    rng = np.random.default_rng(0)
-    weights = tensor(rng.dirichlet(np.full(60, 0.2), size=4), dtype)
-    weights[1, 30:] = 0  # empty slots
-    positions = tensor(np.sort(rng.random((4, 60)), -1), dtype)
-    positions[2] = positions[2].round(decimals=1)  # ties
-    intervals = tensor(rng.random(4) / 60, dtype)
-    wanted = distortion_pairwise(weights.double(), positions.double(), intervals.double())
-    assert distortion(weights, positions, intervals).item() == pytest.approx(wanted, rel=error)
-
-
 def test_distortion_does_not_change_when_the_ray_is_moved():
     rng = np.random.default_rng(1)
     weights, positions = tensor(rng.random((2, 10))), tensor(np.sort(rng.random((2, 10)), -1) / 2)
@@ -133,13 +104,6 @@ def test_total_variation_has_dvgos_gradient(scale):
             expected[n] += float(scales[n, m]) / 6 * np.clip(difference, -1, 1)
     assert np.allclose(values.grad, expected, rtol=1e-12, atol=1e-14)
     assert neighbours.grad is None
-
-
-def test_total_variation_by_hand():
-    # Differences 0.5 (quadratic: 0.125) and 3 (linear: 2.5), scales 1 and 0.5.
-    loss = clamped_differences(tensor([[1.0]]), tensor([[[0.5], [-2.0]]]), tensor([[1.0, 0.5]]))
-    assert loss.item() == pytest.approx((0.125 + 0.5 * 2.5) / 6)
-    assert clamped_differences(tensor([[1.0]]), tensor([[[9.0]]]), tensor([[0.0]])).item() == 0
 
 
 def test_keypoint_depth_by_hand():

@@ -50,16 +50,6 @@ def test_memory_is_that_of_tables_moments_and_pixels(scene, plan_file, tmp_path,
     assert told and float(told[1]) == pytest.approx((tables[0] + pixels[0]) / 2**30, abs=0.006)
 
 
-def test_pixels_read_window_by_window_count_for_that_window(scene):
-    by_window = datamanager(scene, resident_pixels=0)
-    cameras = np.array([1, 2, 5])
-    told = by_window.pixel_bytes(cameras), by_window.pixel_bytes()
-    by_window.use_cameras(cameras)
-    assert told[0] == by_window.sources.pixels.nbytes < told[1]
-    at_once = datamanager(scene)
-    assert at_once.pixel_bytes(cameras) == at_once.pixel_bytes() == told[1]
-
-
 @pytest.mark.parametrize("masks", [False, True])
 def test_of_a_window_with_too_many_pixels_so_many_are_held_as_is_told(scene, tmp_path, masks, capsys):
     data = write_scene(tmp_path / "masked", masks=True) if masks else scene
@@ -111,18 +101,6 @@ def windows_of(plan: ScenePlan) -> WindowedPlan:
     return WindowedPlan.single(plan)
 
 
-def test_a_gpu_keeps_room_for_a_step_a_picture_and_the_allocator(free):
-    """14.5 GiB of tables do not fit in 14.6: a step would find no room at full resolution."""
-    windows = windows_of(large_plan(200e6))
-    tables, reserve = training_bytes(windows.plans[0], None, WORK), reserved_bytes(windows.plans[0], WORK, GPU)
-    assert 1 << 30 < reserve < 4 << 30 and reserved_bytes(windows.plans[0], WORK, "cpu") == 0
-    free((tables + reserve) / 2**30 + 0.01)
-    assert fit_memory(windows, lambda _: None, WORK, GPU) is windows
-    free(tables / 2**30 + 0.1)
-    with pytest.raises(InputError, match="fewer texels"):
-        fit_memory(windows, lambda _: None, WORK, GPU)
-
-
 @pytest.mark.parametrize(("gib", "places"), [(64, 0), (12, 1), (6, 1)])
 def test_texels_of_an_automatic_plan_follow_the_free_memory(free, capsys, gib, places):
     free(gib)
@@ -145,18 +123,3 @@ def test_where_hardly_any_texel_fits_a_run_is_refused(free, stubborn):
     with pytest.raises(InputError, match="GiB are free"):
         fit_memory(plan, lambda _: None, WORK, GPU, lambda most: asked.append(most) or plan)
     assert len(asked) == (memory.ATTEMPTS - 1 if stubborn else 0)
-
-
-def test_a_run_without_room_for_its_texels_plans_larger_ones(scene, tmp_path, monkeypatch, capsys):
-    """Of the rule's plan; a plan of the user's is refused."""
-    config = trainer_config(scene, None, tmp_path, 3000, training="joint")
-    texels = ready(config).pipeline.model.progress.windows.plans[0].texels
-    monkeypatch.setattr(memory, "free_memory", lambda device: 35 * texels)
-    monkeypatch.setattr(memory, "SMALLEST_PLAN", 1e3)
-    monkeypatch.setattr(memory, "LEAST_SHARE", 1.0)
-    model = ready(trainer_config(scene, None, tmp_path / "less", 3000, training="joint")).pipeline.model
-    assert model.progress.windows.plans[0].texels < 0.9 * texels
-    assert "texels are made larger" in capsys.readouterr().out
-    plan = tmp_path / "tiny" / "mmpi-small" / "run" / "plan.json"
-    with pytest.raises(InputError, match="fewer texels"):
-        ready(trainer_config(scene, plan, tmp_path / "asked", 3000, training="joint"))

@@ -6,7 +6,7 @@ import pytest
 from training_runs import schedule_of
 
 from mmpi_ns.config import mmpi_kitti, mmpi_scannet, mmpi_scannet_short
-from mmpi_ns.training.phases import TRAINS, Phase, Schedule, ScheduleConfig, make_schedule
+from mmpi_ns.training.phases import TRAINS, Phase, Schedule
 
 KINDS = ("density", "features", "colour", "reliability", "camera_opt")
 
@@ -23,43 +23,6 @@ def test_phases_follow_each_other_and_end_with_the_run():
         Phase("finetune", 35_000, 40_000),
     )
     assert schedule.total_steps == 40_000
-
-
-def test_paper_schedule_is_30k_individual_and_10k_blend():
-    assert two_phase().phases == (Phase("individual", 0, 30_000), Phase("blend", 30_000, 40_000))
-    assert schedule_of("joint", 30_000).phases == (Phase("joint", 0, 30_000),)
-
-
-@pytest.mark.parametrize(
-    ("step", "name"),
-    [
-        (0, "individual"),
-        (29_999, "individual"),
-        (30_000, "blend"),
-        (39_999, "blend"),
-        (40_000, "blend"),
-        (10**9, "blend"),
-    ],
-)
-def test_a_phase_ends_just_before_the_next_begins(step, name):
-    assert two_phase().phase_at(step).name == name
-
-
-def test_reliability_takes_part_from_the_first_blend_step_on():
-    schedule = two_phase(finetune_share=0.25)
-    phases = [schedule.phase_at(s).name for s in (0, 19_999, 20_000, 29_999, 30_000, 40_000)]
-    assert ["reliability" in TRAINS[name] for name in phases] == [False] * 2 + [True] * 4
-    assert "reliability" not in TRAINS[schedule_of("joint", 100).phase_at(100).name]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_rates_are_zero_exactly_where_a_kind_is_frozen(kind):
-    for schedule in (two_phase(finetune_share=0.25), schedule_of("joint", 100)):
-        for phase in schedule.phases:
-            for step in (phase.start, phase.end - 1):
-                rate = schedule.rate_factor(kind, step)
-                assert type(rate) is float
-                assert (rate > 0) == (kind in TRAINS[phase.name])
 
 
 def test_only_reliability_trains_in_blend_and_everything_else_before():
@@ -86,20 +49,6 @@ def test_texels_double_at_each_growth_step():
     assert [schedule.texel_factor(s) for s in steps] == [1 / 16, 1 / 16, 1 / 8, 1 / 8, 1 / 4, 1 / 2, 1 / 2, 1, 1]
 
 
-@pytest.mark.parametrize(("blend", "finetune"), [(0.5, 0.5), (0.9, 0.2), (-0.1, 0.3), (0.3, -0.1)])
-def test_shares_that_leave_nothing_for_the_first_phase_are_refused(blend, finetune):
-    with pytest.raises(ValueError, match=r"leave no step|must not be negative"):
-        schedule_of("two-phase", 1000, blend_share=blend, finetune_share=finetune)
-
-
-def test_bricks_may_be_released_just_before_the_texels_double():
-    schedule = schedule_of("joint", 1_000, release_shares=(0.1, 3 / 15, 4 / 15, 0.5))
-    assert schedule.growth == (67, 133, 200, 267) and schedule.release == (200, 267, 500)
-    assert [s for s in range(1_000) if schedule.watches(s)] == [*range(133, 500)]
-    once = schedule_of("joint", 1_000, growth_shares=(0.3,), release_shares=(0.3,))
-    assert [s for s in range(1_000) if once.watches(s)] == [*range(300)]
-
-
 def test_texels_may_become_finer_at_releases_after_growth_while_rates_are_high():
     shares = {"release_shares": (3 / 15, 4 / 15, 0.3, 0.5, 0.75), "decay_from": 0.5}
     schedule = schedule_of("joint", 1_000, windows=2, **shares)
@@ -117,11 +66,6 @@ def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count
     assert not any(schedule_of("joint", 100).watches(s) for s in range(100))
     assert schedule_of("joint", 100, growth_shares=(), release_shares=(0.1, 0.2)).release == (20,)
     assert schedule_of("two-phase", 1_000, release_shares=(1.0,)).release == (750,), "shares of the first phase"
-
-
-def test_phases_without_steps_are_left_out():
-    assert [p.name for p in schedule_of("two-phase", 100, blend_share=0.0).phases] == ["individual"]
-    assert schedule_of("two-phase", 1).phases == (Phase("individual", 0, 1),)
 
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
@@ -146,16 +90,24 @@ def test_impossible_schedules_name_the_setting(settings, word):
         schedule_of("two-phase", **settings)
 
 
-def test_a_models_schedule_is_made_of_its_options():
-    options = ScheduleConfig("two-phase", decay_decades=2.0, decay_from=0.25)
-    schedule = make_schedule(options, 5000, 3)
-    assert (schedule.decay_decades, schedule.decay_from) == (2.0, 0.25)
-    assert schedule.windows == 3
-
-
 @pytest.mark.parametrize("method", [mmpi_kitti, mmpi_scannet, mmpi_scannet_short])
 def test_the_papers_methods_keep_its_rates(method):
     model, optimizers = method.config.pipeline.model, method.config.optimizers
     assert (model.schedule.decay_decades, model.schedule.decay_from) == (1.5, 0.0)
     assert model.colour.feature_channels == 9
     assert optimizers["colour"]["optimizer"].lr == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("step", "name"),
+    [
+        (0, "individual"),
+        (29_999, "individual"),
+        (30_000, "blend"),
+        (39_999, "blend"),
+        (40_000, "blend"),
+        (10**9, "blend"),
+    ],
+)
+def test_a_phase_ends_just_before_the_next_begins(step, name):
+    assert two_phase().phase_at(step).name == name

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from training_runs import schedule_of
 
-from mmpi_ns.rendering.pipeline import summary
 from mmpi_ns.training import report
 
 
@@ -38,11 +37,3 @@ def test_a_line_says_phase_speed_psnr_and_time_left(monkeypatch, capsys):
     assert lines[-1] == "step 400 of 400 | finetune | 2,000 rays/s | batch PSNR 20.0 dB | 0 s left"
     assert 40 <= len(lines) <= 44
     assert any(line.startswith("step 201 of 400 | blend") for line in lines), "a phase begins"
-
-
-def test_evaluation_is_summed_up_in_a_line():
-    found = [("a.png", {"psnr": 20.0, "ssim": 0.5}), ("b.png", {"psnr": 24.0, "ssim": 0.7}), ("c.png", {"psnr": 25.0})]
-    assert summary(found) == (
-        "3 images: PSNR 23.00 dB (worst 20.00, a.png; best 25.00, c.png), SSIM 0.600 (0.500 to 0.700)"
-    )
-    assert summary([("a.png", {"psnr": 20.0})]) == "1 images: PSNR 20.00 dB (worst 20.00, a.png; best 20.00, a.png)"
