@@ -89,7 +89,6 @@ gallery: venv ## Train four procedural scenes and write docs/gallery.md with the
 
 results: venv ## Make every number of README.md and docs/results (hours; what is finished is kept): DATA=captures/
 	$(BIN)/python benchmarks/accuracy.py
-	PYTHONPATH=tests:benchmarks $(BIN)/python tests/stability/table.py
 	$(BIN)/python benchmarks/results.py --data $(DATA) $(ARGS)
 
 clean: ## Remove build products and caches (not .venv)

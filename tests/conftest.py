@@ -32,10 +32,7 @@ def pytest_configure(config):
         _copy_kernels(source, Path(CACHE, "mmpi_ns"))
 
 
-LONGEST = (
-    "test_gpu", "test_bench_gpu", "test_bench_roads", "test_commands", "test_bench_train", "test_window_training",
-    "test_shared_windows",
-)  # fmt: skip
+LONGEST = ("test_gpu", "test_commands", "test_window_training", "test_resume", "test_moving_masks")
 """Files whose few tests take minutes."""
 
 

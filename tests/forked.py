@@ -128,11 +128,6 @@ def start_train(data, output, method="mmpi_small", memory=None, environment=None
     return Running("ns-train", given, [], memory, environment, shown_on)
 
 
-def call(function, *arguments, memory=None):
-    """Calls a function of a test module in a fork, to its end."""
-    return Running(function, None, list(arguments), memory).end()
-
-
 def _child(folder, name, options, arguments, memory, environment):
     for number, stream in ((1, "out"), (2, "error")):
         os.dup2(os.open(folder / stream, os.O_CREAT | os.O_WRONLY | os.O_APPEND), number)

@@ -128,8 +128,3 @@ def mpis(draw):
         extent=(u0, u0 + draw(numbers(0.1, 6)), v0, v0 + draw(numbers(0.1, 6))),
         planes=draw(st.integers(2, 40)),
     )
-
-
-def range_of(near):
-    """fars for a given near: finite or infinite."""
-    return st.just(math.inf) | numbers(near, near + 40)

@@ -38,7 +38,6 @@ class Shapes(NamedTuple):
 
 
 SMALL = Shapes()
-EVERY = (Shapes((1, 2, 5, 9, 33)), Shapes((1, 4, 16, 64), cube=False, channels=9))
 
 
 def differences(name: str, device: str, shapes: Shapes = SMALL) -> list[float]:

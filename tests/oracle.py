@@ -264,34 +264,3 @@ def render_ray(samples_by_head, blends=True):
     return RenderedRay(
         samples, np.array(taus), gathered.weights, color, gathered.accumulation, gathered.transmittance, median
     )
-
-
-def sample_mpi(head, mpis, origin, direction, near, far, tau_of, color_of, reliability_of):
-    """Samples of one MPI: its live planes, with what the callables answer.
-
-    Args:
-        head: index of the MPI in ``mpis``.
-        tau_of: (head, plane, u, v) in normalised NDC -> optical depth.
-        color_of: (head, plane, u, v) in normalised NDC -> colour [3].
-        reliability_of: (head, ndc [3]) -> R.
-    """
-    samples, (u0, u1, v0, v1) = [], mpis[head].extent
-    for hit in crossings(mpis[head], origin, direction, near, far):
-        if not hit.live:
-            continue
-        u, v = 2 * (hit.u - u0) / (u1 - u0) - 1, 2 * (hit.v - v0) / (v1 - v0) - 1
-        places = [ray_point_to_ndc(m, origin, direction, hit.inverse_t) for m in mpis]
-        cover = [(p is not None and bool(np.all(np.abs(p) <= 1))) or j == head for j, p in enumerate(places)]
-        votes = [reliability_of(j, p) if c else 0.0 for j, (p, c) in enumerate(zip(places, cover, strict=True))]
-        samples.append(
-            RaySample(
-                head,
-                hit.plane,
-                hit.inverse_t,
-                float(tau_of(head, hit.plane, u, v)),
-                np.asarray(color_of(head, hit.plane, u, v), np.float64),
-                np.array(votes, np.float64),
-                np.array(cover, bool),
-            )
-        )
-    return samples

@@ -5,7 +5,12 @@ from __future__ import annotations
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_map_only
-from waits import NO_LAUNCH, WAITING
+
+WAITING = {
+    "_local_scalar_dense", "nonzero", "_unique2", "unique_dim", "unique_consecutive", "masked_select", "equal",
+    "bincount", "lift_fresh",
+}  # fmt: skip
+"""Operations of torch that wait for a GPU whatever they are given; no graph may hold one."""
 
 
 class Tape(TorchDispatchMode):
@@ -15,15 +20,14 @@ class Tape(TorchDispatchMode):
         super().__init__()
         self.done = []
         self.paused = False
-        self.nodes, self.waits = 0, []
-        """Kernels that a graph would hold, and operations that a GPU would be waited for."""
+        self.waits = []
+        """Operations that a GPU would be waited for."""
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         made = func(*args, **kwargs)
         if not (self.paused or func.is_view):
             name = func.overloadpacket.__name__
-            self.nodes += not name.startswith(NO_LAUNCH)
             by_mask = name.startswith("index") and any(
                 isinstance(i, torch.Tensor) and i.dtype in (torch.bool, torch.uint8)
                 for i in (args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else ())
@@ -62,7 +66,6 @@ class TapeRecorder:
         tape, launch = Tape(), GridExecutor.__call__
 
         def noted(executor, *args, **kwargs):
-            tape.nodes += 1
             tape.done.append((lambda *_: launch(executor, *args, **kwargs), (), {}, None))
             tape.paused = True
             try:

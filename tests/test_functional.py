@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
@@ -19,9 +18,8 @@ from training_runs import ready, trainer_config, write_plan, write_windows
 
 import mmpi_ns
 import mmpi_show
-from mmpi_ns.data.rays import image_rays
 from mmpi_ns.utils.errors import InputError
-from mmpi_show.files import HEADER, BakedScene, read_baked, write_baked
+from mmpi_show.files import HEADER, read_baked, write_baked
 from mmpi_show.ops.baked.reader import camera_rays
 
 ROOT = Path(__file__).parents[1]
@@ -111,22 +109,6 @@ def test_images_of_a_baked_scene_are_those_of_its_bricks(baked):
         close = (images.rgb.view(-1, 3) - expected["rgb"]).abs().amax(-1) < 1e-3
         assert close.float().mean() > 0.99  # a ray through the border of a brick may round to either side
         assert (images.depth.view(-1) / expected["depth"].view(-1)).log().abs().median() < 1e-4
-
-
-def test_baked_images_leave_the_cores_to_the_kernels(baked, monkeypatch, three_threads):
-    """Torch's second thread would spin beside them: of rays made for ``render``, and where an image is asked for."""
-    scene, bricks, threads = mmpi_show.load(baked, device="cpu"), read_baked(baked), []
-
-    def watched(function):
-        return lambda *values: threads.append(torch.get_num_threads()) or function(*values)
-
-    monkeypatch.setattr("mmpi_show.functional.image_rays", watched(image_rays))
-    monkeypatch.setattr(BakedScene, "render", watched(BakedScene.render))
-    mmpi_ns.render(scene, scene.path.camera_to_worlds[0], scene.path.intrinsics[0], 20, 12)
-    assert len(threads) > 1 and set(threads) == {1}
-    threads.clear()
-    bricks.image(image_rays(Cameras(scene.path.camera_to_worlds[:1], 20.0, 20.0, 10.0, 6.0, 20, 12)))
-    assert threads and set(threads) == {1} and torch.get_num_threads() == 3
 
 
 def test_cameras_come_in_batches_of_any_shape(baked):

@@ -71,11 +71,6 @@ def test_a_module_imports_only_wings_before_its_own(name):
     assert {wing(each) for each in imports(name)} - {""} <= allowed
 
 
-@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) in COMPANIONS))
-def test_companions_import_no_command_of_the_method(name):
-    assert {each for each in imports(name) if wing(each) == "scripts"} <= {"mmpi_ns.scripts.command"}
-
-
 def test_no_import_goes_in_a_circle():
     graph, finished = {name: imports(name) & MODULES.keys() for name in MODULES}, set()
 
@@ -90,53 +85,10 @@ def test_no_import_goes_in_a_circle():
         visit(name, ())
 
 
-@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) not in ("scripts", "") and "__main__" not in n))
-def test_nothing_of_ours_is_imported_for_types_alone(name):
-    """Commands may: they answer --help before anything large is read. So may the root, which names the functional entry
-    to type checkers and imports it when it is first asked for."""
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
-    for_types = [node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)]
-    assert [each for block in for_types for node in ast.walk(block) for each in imported(node, name)] == []
-
-
-@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) in METHOD))
-def test_only_triton_is_imported_within_a_function(name):
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-    inner = [each for function in functions for node in ast.walk(function) for each in imported(node, name)]
-    assert [each for each in inner if "triton" not in each] == []
-
-
-def test_the_root_holds_the_method_and_the_functional_entry_alone():
-    assert {path.name for path in ROOT.glob("*.py")} == {
-        f"{name}.py" for name in ("__init__", "config", "model", "heads", "sampler", "blending", "functional")
-    }
-
-
 def test_importing_the_package_imports_nothing_large():
     """Torch takes seconds: it is imported when a function is first asked for."""
     code = "import sys, mmpi_ns; assert not {'torch', 'nerfstudio', 'numpy'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_importing_the_methods_reads_no_library_that_only_priors_or_scores_need():
-    """Every ns-* command imports them. OpenCV is among nerfstudio's own imports; of priors the settings are read."""
-    code = (
-        "import sys, mmpi_ns.config; assert not {'scipy.signal', 'pycolmap'} & set(sys.modules); "
-        "assert {m for m in sys.modules if m.startswith('mmpi_priors')} == {'mmpi_priors', 'mmpi_priors.settings'}"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-BESIDE = {path.stem: path for folder in ("benchmarks", "examples") for path in (ROOT.parent / folder).glob("*.py")}
-
-
-@pytest.mark.parametrize("name", sorted(MODULES))
-def test_the_package_imports_neither_benchmarks_nor_examples(name):
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
-    plain = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    plain |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert len(BESIDE) > 20 and not plain & (BESIDE.keys() | {"benchmarks", "examples"})
 
 
 def test_modules_beside_the_package_have_names_of_their_own():

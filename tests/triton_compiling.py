@@ -1,19 +1,15 @@
 """Compiles the Triton kernels for GPUs that are not there: every launch becomes a compilation for its arguments.
 
-With another release of Triton, on the path before the installed one (two minutes an architecture; ``--largest`` halves
-that by compiling each kernel once, with the most in it):
+To try another release of Triton, put it on the path before the installed one and run ``tests/ops/test_gpu.py``:
 
     pip install --no-deps --target triton-3.1 triton==3.1.0
-    PYTHONPATH=triton-3.1:.:tests python tests/triton_compiling.py 75 80 86 89 90
 """
 
 from __future__ import annotations
 
 import importlib
 import subprocess
-import sys
 import tempfile
-import time
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +23,6 @@ from triton.compiler import ASTSource
 
 from mmpi_ns.ops import dispatch
 
-ARCHITECTURES = (75, 80, 86, 89, 90)
-"""Turing, Ampere (A100), Ampere (RTX 30), Ada, Hopper."""
 NAMES = {
     torch.float32: "*fp32",
     torch.bfloat16: "*bf16",
@@ -144,27 +138,3 @@ def spills(kernel):
     does not take all registers that there are."""
     found = resources(kernel)
     return "STACK:0" not in found and "REG:255" in found
-
-
-def main(architectures, largest):
-    """Compiles all, or the largest of each kernel, and says what does not compile."""
-    launches, failed = all_launches(setattr), 0
-    launches = list(largest_launches(launches).values()) if largest else launches
-    print(f"Triton {triton.__version__}: {len(launches)} kernels", flush=True)
-    for architecture in architectures:
-        start, spilling = time.monotonic(), []
-        for launch in launches:
-            try:
-                if spills(launch.compiled(architecture)):
-                    spilling.append(launch.name)
-            except Exception as error:
-                failed += 1
-                print(f"sm_{architecture} {launch.name} {dict(launch.constants)}: {type(error).__name__}: {error}")
-        seconds = time.monotonic() - start
-        said = f"registers spill in {', '.join(spilling)}" if spilling else "no register spills"
-        print(f"sm_{architecture}: {failed} failed so far, {said}, {seconds:.0f} s", flush=True)
-    return failed > 0
-
-
-if __name__ == "__main__":
-    sys.exit(main([int(word) for word in sys.argv[1:] if word.isdigit()] or ARCHITECTURES, "--largest" in sys.argv))

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
-import resource
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, name_of, write_scene
-from training_runs import datamanager, ready, trainer_config, write_plan
+from training_runs import datamanager, ready, trainer_config
 
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_priors.observe import ENOUGH_KEYPOINTS
@@ -58,13 +51,6 @@ def keep_one(meta):
     meta["frames"] = meta["frames"][:1]
 
 
-def set_pose(value):
-    def change(meta):
-        meta["frames"][3]["transform_matrix"] = value
-
-    return change
-
-
 # The capture ---------------------------------------------------------------------------------------------------------
 
 
@@ -81,31 +67,7 @@ def test_one_place_can_be_trained_on_request_and_says_what_it_cannot_learn(data,
     assert all(torch.isfinite(p).all() for p in trainer.pipeline.model.parameters())
 
 
-def test_without_test_images_training_images_are_scored_and_it_says_so(data, capsys):
-    edit(data, keep_one)
-    manager = datamanager(data, dataparser=NerfstudioDataParserConfig(auto_scale_poses=False))
-    assert manager.eval_dataset.image_filenames == manager.train_dataset.image_filenames
-    assert "no test images" in " ".join(capsys.readouterr().out.split())
-
-
 # Images and masks ----------------------------------------------------------------------------------------------------
-
-
-def test_an_image_that_was_rounded_up_by_a_pixel_is_cut_to_its_camera(data):
-    """Its depths too; they are along the optical axis."""
-    (data / "depths").mkdir()
-    for i in range(8):
-        Image.fromarray(np.zeros((HEIGHT + 1, WIDTH + 1, 3), np.uint8)).save(data / "images" / name_of(i))
-        Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(data / "depths" / name_of(i))
-    edit(data, lambda meta: [f.update(depth_file_path=f"depths/{name_of(i)}") for i, f in enumerate(meta["frames"])])
-    manager = datamanager(data)
-    assert len(manager.sources.pixels.colors) == len(TRAIN) * WIDTH * HEIGHT
-    assert manager.eval_dataset[0]["image"].shape == (HEIGHT, WIDTH, 3)
-    far, camera = manager.eval_dataset[0]["distance"], manager.eval_dataset.cameras[0]
-    u, v = (0.5 - float(camera.cx)) / float(camera.fx), (0.5 - float(camera.cy)) / float(camera.fy)
-    unit = manager.eval_dataset.metadata["depth_unit_scale_factor"] * manager.train_dataparser_outputs.dataparser_scale
-    assert far.shape == (HEIGHT, WIDTH, 1)
-    assert float(far[0, 0]) == pytest.approx(4000 * unit * (1 + u * u + v * v) ** 0.5, rel=1e-5)
 
 
 @pytest.mark.parametrize("i", [TRAIN[2], TEST[1]])
@@ -164,18 +126,6 @@ def test_a_model_whose_points_are_all_behind_the_cameras_is_not_used(data, capsy
     assert not len(observations.seen_at)
 
 
-def test_single_points_behind_their_cameras_are_left_out(data, capsys):
-    whole = datamanager(data).observations
-    move_points(data, lambda n, p: p * [1, 1, -1] if n % 9 == 4 else p)
-    found = datamanager(data).observations
-    said = " ".join(capsys.readouterr().out.split())
-    lost = len(whole.seen_at) - len(found.seen_at)
-    assert f"{lost} of {len(whole.seen_at)} keypoints have their point behind the camera" in said
-    assert 0 < lost < len(whole.seen_at) / 4 and len(found.seen_at) == len(found.seen_by) == len(found.seen_point)
-    ahead = found.points[found.seen_point] - found.centers[found.seen_by]
-    assert (np.einsum("qi,qi->q", ahead, -found.camera_to_worlds[found.seen_by][:, :, 2]) > 0).all()
-
-
 def test_placement_refuses_points_behind_every_camera(scene):
     observations = datamanager(scene).observations
     turned = replace(observations, camera_to_worlds=observations.camera_to_worlds * np.array([-1, 1, -1, 1]))
@@ -186,77 +136,7 @@ def test_placement_refuses_points_behind_every_camera(scene):
 # Crops ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def trained(scene, plan_file, tmp_path_factory):
-    """A short run with a checkpoint."""
-    trainer = ready(trainer_config(scene, plan_file, tmp_path_factory.mktemp("run"), 6))
-    trainer.train()
-    return trainer
-
-
-@pytest.mark.parametrize("scale", [(0.0, 0.0, 0.0), (1.0, -1.0, 1.0), (1.0, float("nan"), 1.0)])
-def test_a_crop_without_size_is_refused(trained, scale):
-    camera = trained.pipeline.datamanager.eval_dataset.cameras[:1]
-    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), scale)
-    model = trained.pipeline.model.eval()
-    refusal(lambda: model.get_outputs_for_camera(camera, obb_box=box), "no size", "crop_scale")
-    model.train()
-
-
 # Checkpoints ---------------------------------------------------------------------------------------------------------
-
-
-def contents(folder):
-    return {p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-def test_a_disk_that_is_full_while_saving_leaves_the_last_checkpoint(trained, scene, plan_file, tmp_path):
-    trainer = ready(trainer_config(scene, plan_file, tmp_path, 6))
-    trainer.config.save_only_latest_checkpoint = True
-    trainer.save_checkpoint(2)
-    before = contents(trainer.base_dir)
-    size = trainer.checkpoint_dir.joinpath("step-000000002.ckpt").stat().st_size
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, limits[1]))  # the real writer fails half way through
-    try:
-        for step in (2, 3):
-            words = (f"step-{step:09d}.ckpt could not be written", "MB free", "make room")
-            refusal(lambda step=step: trainer.save_checkpoint(step), *words, error=OSError)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert contents(trainer.base_dir) == before
-    again = ready(trainer_config(scene, plan_file, tmp_path / "again", 6), load_dir=trainer.checkpoint_dir)
-    assert again._start_step == 3
-
-
-def test_a_checkpoint_cut_short_is_named(trained, scene, plan_file, tmp_path):
-    folder = tmp_path / "models"
-    folder.mkdir()
-    whole = (trained.checkpoint_dir / "step-000000005.ckpt").read_bytes()
-    (folder / "step-000000005.ckpt").write_bytes(whole[: len(whole) // 2])
-    config = trainer_config(scene, plan_file, tmp_path / "out", 6)
-    refusal(lambda: ready(config, load_dir=folder), folder / "step-000000005.ckpt", "cannot be read", "--load-step")
-
-
-def test_a_run_resumed_with_another_number_of_mpis_is_refused_and_changes_nothing(scene, tmp_path):
-    def config(num_mpis):
-        plan = write_plan(scene, tmp_path / "plan.json", num_mpis=num_mpis)
-        return trainer_config(scene, plan, tmp_path, 4)
-
-    config(1).save_config()
-    first = ready(config(1))
-    first.train()
-    before = contents(first.base_dir)
-    refusal(
-        lambda: ready(config(2), load_dir=first.checkpoint_dir),
-        "another scene plan (1 MPIs there, 2 MPIs here)", "config.yml", "--pipeline.model.plan-file",
-    )  # fmt: skip
-    after = contents(first.base_dir)
-    # TensorBoard writes what it still holds of the first run whenever it likes.
-    assert all(after[name] == data for name, data in before.items() if "tfevents" not in name.name)
-    refusal(config(2).save_config, "holds checkpoints of an earlier run", "--load-dir", "--timestamp")
-    _, pipeline, _, step = eval_setup(first.base_dir / "config.yml")
-    assert step == 3 and len(pipeline.model.field.plan.mpis) == 1
 
 
 # Devices, and the command as a whole ---------------------------------------------------------------------------------
@@ -268,15 +148,3 @@ def test_a_gpu_asked_for_where_there_is_none(scene, plan_file, tmp_path):
     config.machine.device_type = "cuda"
     refusal(config.save_config, "--machine.device-type cuda", "torch sees none", "--machine.device-type cpu")
     assert not list(tmp_path.iterdir()), "before anything is written"
-
-
-def test_the_command_ends_with_the_sentence_and_status_1(data, tmp_path):
-    edit(data, lambda meta: meta["frames"][3].pop("transform_matrix"))
-    done = subprocess.run(
-        [str(Path(sys.executable).with_name("ns-train")), "mmpi-small", "--data", str(data), "--output-dir",
-         str(tmp_path / "out"), "--machine.device-type", "cpu", "--vis", "tensorboard"],
-        capture_output=True, text=True, timeout=200, env=os.environ | {"COLUMNS": "200"},
-    )  # fmt: skip
-    last = done.stderr.strip().splitlines()[-1]
-    assert done.returncode == 1 and last.startswith("mmpi_ns.utils.errors.InputError: Frame")
-    assert name_of(3) in last and last.endswith("remove the frame.")

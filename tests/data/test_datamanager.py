@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
-import sys
 
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
-from training_runs import datamanager, in_capture_frame, plan_of, ready, trainer_config, write_plan
+from training_runs import datamanager, in_capture_frame
 
 from mmpi_ns.data import rays
-from mmpi_ns.data.checks import say_once
-from mmpi_ns.data.priors import UNKNOWN, DepthPriors, PriorsConfig
 from mmpi_ns.data.rays import CameraRays, image_rays
-from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError
-from mmpi_priors import depth_priors
 from mmpi_priors.sfm import MIN_TRACK
 
 TRACKED = sum(project(i, wall_points())[1].astype(int) for i in range(8)) >= MIN_TRACK
@@ -70,30 +63,6 @@ def test_rays_drawn_ahead_are_those_of_the_step_whatever_comes_between(scene, ma
         torch.set_num_threads(1)
 
 
-def test_without_priors_cameras_alone_are_known_and_pixels_alone_are_drawn(scene, tmp_path, monkeypatch):
-    config = trainer_config(scene, write_plan(scene, tmp_path / "plan.json"), tmp_path / "outputs", steps=3)
-    monkeypatch.setitem(sys.modules, "mmpi_priors.maker", None)  # importing it fails
-    config.pipeline.datamanager.priors = PriorsConfig()
-    trainer = ready(config)
-    manager = trainer.pipeline.datamanager
-    record = manager.priors
-    assert record.depths is record.masks is record.gains is record.new_views is None
-    assert len(record.placement.centers) == len(TRAIN) and not len(record.placement.points)
-    drawn, batch = manager.next_train(0)
-    assert len(drawn) == len(batch["indices"]) and not drawn.disparities.any() and not drawn.keypoint_disparities.any()
-    before = trainer.pipeline.model.field.density.data.clone()
-    trainer.train()
-    assert not torch.equal(before, trainer.pipeline.model.field.density.data)
-
-
-def test_a_share_of_the_rays_is_drawn_if_asked_for(scene):
-    manager = datamanager(scene)
-    for share, count in ((0.5, 32), (1.0, 64), (0.0, 1)):
-        manager.share_of_rays = share
-        rays, batch = manager.next_train(0)
-        assert len(batch["indices"]) == count and len(rays) == count + 16
-
-
 def test_a_batch_holds_the_colours_of_the_pixels_that_its_rays_pass(manager):
     rays, batch = manager.next_train(0)
     assert len(rays) == 64 + 16 and batch["image"].shape == (64, 3)
@@ -105,12 +74,6 @@ def test_a_batch_holds_the_colours_of_the_pixels_that_its_rays_pass(manager):
     assert torch.allclose(rays.directions[:64], wanted.directions, atol=1e-6)
     assert torch.allclose(rays.origins[:64], wanted.origins)
     assert (rays.keypoint_disparities[:64] == 0).all() and (rays.keypoint_disparities[64:] > 0).all()
-
-
-def test_every_training_pixel_can_be_drawn(manager):
-    assert len(manager.sources.pixels.colors) == len(TRAIN) * WIDTH * HEIGHT
-    drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(30)])
-    assert set(drawn[:, 0].tolist()) == set(range(6)) and drawn[:, 1].max() > 20 and drawn[:, 2].max() > 28
 
 
 def test_masked_pixels_are_never_drawn(tmp_path):
@@ -137,14 +100,6 @@ def test_a_mask_over_all_of_a_test_image_is_named(tmp_path):
         manager.next_eval(0)
 
 
-def test_an_image_that_cannot_be_read_is_named(tmp_path):
-    data = write_scene(tmp_path / "broken")
-    path = data / "images" / name_of(3)
-    path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(ValueError, match=name_of(3)):
-        datamanager(data)
-
-
 def test_transparency_reaches_the_batch(tmp_path):
     manager = datamanager(write_scene(tmp_path / "alpha", alpha=True))
     batch = manager.next_train(0)[1]
@@ -164,33 +119,6 @@ def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
     for camera, point, at in zip(observations.seen_by, observations.seen_point, observations.seen_at, strict=True):
         pixels, _ = project(TRAIN[camera], wall_points()[TRACKED])
         assert np.abs(pixels[row[point]] - at).max() < 1e-6
-
-
-def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie_in_it(manager, monkeypatch):
-    seen, depths, dataset = manager.observations, manager.priors.depths, manager.train_dataset
-    keypoints, cells = len(seen.seen_by), (np.stack(depths.codes)[..., 0] > UNKNOWN).sum()  # a cell is one pixel here
-    for most, both in ((keypoints / cells + 0.01, True), (keypoints / cells - 0.01, False)):
-        monkeypatch.setattr(depth_priors, "MOST_KEYPOINTS", most)
-        placed = depth_priors.of_cells(seen, depths, dataset)
-        assert len(placed.seen_by) == cells + both * keypoints and len(placed.seen_at) == both * len(seen.seen_at)
-        assert np.array_equal(placed.seen_by[: both * keypoints], seen.seen_by[: both * keypoints])
-        assert len(placed.points) == cells + both * len(seen.points)
-    monkeypatch.setattr(depth_priors, "CELLS", 4)  # of 8 x 8 pixels
-    placed = depth_priors.of_cells(manager.observations, manager.priors.depths, manager.train_dataset)
-    expected = []
-    for i in range(6):
-        inverse, error = np.moveaxis(manager.priors.depths.image(i), -1, 0)
-        for row, column in np.ndindex(3, 4):
-            part = slice(8 * row, 8 * row + 8), slice(8 * column, 8 * column + 8)
-            known = inverse[part] > 0
-            if known.any():
-                best = (error[part][known] / inverse[part][known]).argmin()
-                expected.append((i, 1 / inverse[part][known][best]))
-    distances = np.linalg.norm(placed.points[placed.seen_point] - placed.centers[placed.seen_by], axis=-1)
-    assert len(expected) > 30 and len(placed.seen_at) == 0
-    assert np.allclose(np.stack([placed.seen_by, distances], -1), expected, rtol=1e-5)
-    nothing = DepthPriors([np.full((HEIGHT, WIDTH, 2), UNKNOWN, np.int16)] * len(manager.train_dataset))
-    assert depth_priors.of_cells(manager.observations, nothing, manager.train_dataset) is manager.observations
 
 
 def test_a_keypoint_ray_ends_on_its_point_at_the_known_distance(manager):
@@ -232,75 +160,6 @@ def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(s
     assert set(manager.sources.keypoints.camera_indices[:, 0].tolist()) == {0, 1, 2}
     manager.use_cameras(None)
     assert len(manager.sources.new_views.pixels) == count
-
-
-@pytest.mark.parametrize(("settings", "says"), [({}, False), ({"keypoint_rays": 0, "dense_depth": False}, True)])
-def test_a_run_without_any_depth_says_so_and_draws_pixels(scene, capsys, settings, says):
-    manager = datamanager(scene, depth_images=False, new_view_share=1.0, **settings)
-    assert ("No depths are known" in capsys.readouterr().out) == says
-    assert (len(manager.next_train(0)[0]) == 64) == says
-
-
-def test_new_views_are_drawn_by_window_where_pixels_are_read_by_window(scene):
-    manager = datamanager(scene, new_view_share=1.0, resident_pixels=10.0)
-    assert manager.sources is None, "nothing is read before a window asks"
-    manager.use_cameras(np.array([0, 1, 2]))
-    assert set(manager.sources.new_views.pixels[:, 0].tolist()) <= {0, 1, 2}
-
-
-def test_one_window_of_more_pixels_than_are_held_has_its_new_views_and_keypoints(scene):
-    """In a run; they were missing in all of it."""
-    all_held, some = (datamanager(scene, new_view_share=1.0, resident_pixels=n) for n in (60e6, 1000.0))
-    some.use_cameras(None)
-    assert len(some.sources.pixels.colors) <= 1000 < len(all_held.sources.pixels.colors)
-    assert torch.equal(some.sources.new_views.pixels, all_held.sources.new_views.pixels)
-    assert torch.equal(some.sources.keypoints.camera_indices, all_held.sources.keypoints.camera_indices)
-    assert len(some.next_train(0)[0]) == 128
-
-
-@pytest.mark.parametrize(("settings", "shares"), [
-    ({}, "80 % pixels, 0 % new views (--pipeline.datamanager.new-view-share 0), 20 % keypoints"),
-    ({"new_view_share": 1.0}, "50 % pixels, 50 % new views, 0 % keypoints (new views take their place)"),
-    ({"new_view_share": 1.0, "dense_depth": False, "sfm_path": "none", "triangulate": False},
-     "100 % pixels, 0 % new views (no pixel has a known depth), 0 % keypoints (no SfM tracks)"),
-    ({"keypoint_rays": 0, "new_view_share": 1.0, "resident_pixels": 10.0},
-     "50 % pixels, 50 % new views, 0 % keypoints (--pipeline.datamanager.keypoint-rays 0)"),
-])  # fmt: skip
-def test_the_share_of_each_source_is_told_with_the_reason_where_it_is_none(scene, capsys, settings, shares):
-    say_once.cache_clear()
-    manager = datamanager(scene, depth_images=False, **settings)
-    capsys.readouterr()
-    manager.use_cameras(None)
-    assert f"Rays of a step: {shares}." in " ".join(capsys.readouterr().out.split())
-
-
-def test_a_colmap_model_that_cannot_be_read_is_named(tmp_path):
-    data = write_scene(tmp_path / "broken")
-    (data / "colmap/sparse/0/images.txt").write_text("1 2 three\nfour\n")
-    with pytest.raises(ValueError, match=r"COLMAP model in .* cannot be read"):
-        datamanager(data)
-
-
-def test_poses_that_are_not_finite_are_refused(tmp_path):
-    data = write_scene(tmp_path / "nan", sfm=False)
-    meta = json.loads((data / "transforms.json").read_text())
-    meta["frames"][0]["transform_matrix"][0][3] = float("nan")
-    (data / "transforms.json").write_text(json.dumps(meta))
-    with pytest.raises(ValueError, match="pose"):
-        datamanager(data)
-
-
-def test_the_placement_rule_makes_a_plan_for_the_scene(manager):
-    plan = place(manager.observations, PlacementConfig())
-    assert isinstance(plan, ScenePlan) and plan == place(manager.observations, PlacementConfig())
-    assert ScenePlan.from_json(plan.to_json()) == plan
-
-
-def test_a_hand_written_plan_covers_the_wall(manager):
-    plan = plan_of(manager.observations)
-    for mpi in plan.mpis:
-        local = (wall_in_scene_units(manager) - mpi.origin) @ np.array(mpi.axes).T
-        assert (local[:, 2] > mpi.near).all() and (np.abs(local[:, 0] / local[:, 2]) < 1).mean() > 0.9
 
 
 def test_keypoints_on_masked_pixels_are_left_out(tmp_path, manager):
@@ -363,32 +222,6 @@ def test_rays_through_a_lens_are_nerfstudios(scene, kind, monkeypatch):
         image, whole = image_rays(alone), alone.generate_rays(camera_indices=0, keep_shape=True)
         assert image.directions.shape == whole.directions.shape
         assert torch.allclose(image.directions, whole.directions, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("kind", "lens"),
-    [
-        (CameraType.PERSPECTIVE, (-0.08, 0.02, 0.0, 0.0, 1e-3, -5e-4)),
-        (CameraType.FISHEYE, (0.02, -0.005, 1e-3, 0.0, 0.0, 0.0)),
-        (CameraType.FISHEYE, (0.0,) * 6),
-    ],
-)
-def test_the_directions_of_a_lens_have_nerfstudios_bits(kind, lens, monkeypatch):
-    """In parts that end within the image; the principal point lies between pixels."""
-    monkeypatch.setattr(rays, "UNDISTORTED", 7 * 50)
-    sizes = {"fx": 40.0, "fy": 41.5, "cx": 24.3, "cy": 20.0, "width": 50, "height": 40}
-    camera = Cameras(torch.eye(4)[None, :3], **sizes, distortion_params=torch.tensor([lens]), camera_type=kind)
-    theirs = camera.generate_rays(0, keep_shape=True).directions
-    ours = rays.pixel_directions((*sizes.values(), kind.value, *lens))
-    assert torch.equal(ours, theirs.view(-1, 3))
-
-
-def test_the_middle_of_a_fisheye_looks_ahead(scene):
-    cameras = copy.deepcopy(datamanager(scene).train_dataset.cameras)[0:1]
-    cameras.camera_type = torch.full_like(cameras.camera_type, CameraType.FISHEYE.value)
-    cameras.cx[:], cameras.cy[:] = 10.5, 7.5
-    middle = CameraRays.of(cameras, "cpu")(torch.tensor([[0, 7, 10]])).directions[0]
-    assert torch.allclose(middle, -cameras.camera_to_worlds[0, :, 2], atol=1e-6)
 
 
 def test_other_cameras_are_left_to_nerfstudio(scene, monkeypatch):

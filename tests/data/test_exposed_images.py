@@ -12,7 +12,6 @@ from training_runs import datamanager, in_capture_frame
 from mmpi_ns.data.datamanager import CAPTURE
 from mmpi_ns.data.posed_images import posed_images
 from mmpi_ns.rendering.exposure import Exposures
-from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.training.losses import photometric
 from mmpi_priors.photometry import ExposedView, exposure_of_view
 
@@ -59,23 +58,6 @@ def test_colours_of_the_field_fit_its_range(manager):
     assert manager.next_train(0)[1]["image"].max() <= 1
 
 
-def test_images_of_one_exposure_are_drawn_as_they_are(scene):
-    plain, without = datamanager(scene), datamanager(scene, correct_exposure=False)
-    assert plain.priors.gains is None
-    for one, other in zip(plain.next_train(3), without.next_train(3), strict=True):
-        names = ("directions",) if not isinstance(one, dict) else ("image", "indices")
-        for name in names:
-            a, b = (x[name] if isinstance(x, dict) else getattr(x, name) for x in (one, other))
-            assert torch.equal(a, b)
-    assert plain.next_train(3)[0].exposures is None
-
-
-def test_exposures_that_exif_notes_as_equal_are_not_searched(exposed, monkeypatch, capsys):
-    monkeypatch.setattr("mmpi_priors.maker.light_of", lambda file: 0.01)
-    assert datamanager(exposed).priors.gains is None
-    assert "EXIF notes the same" in capsys.readouterr().out
-
-
 def test_exposure_of_an_image_without_calibration_is_that_of_what_it_shows(manager):
     cameras = posed_images(manager.observations, manager.train_dataset)
     number, held_out = 2, TRAIN[2]
@@ -107,16 +89,6 @@ def test_the_loss_is_that_in_the_image():
     assert photometric(predicted, observed, exposure).item() == pytest.approx(expected.item())
 
 
-def test_a_clipped_pixel_asks_for_no_less_than_it_shows():
-    observed, exposure = torch.full((1, 3), 0.5), torch.full((1, 3), 2.0)
-    brighter = torch.full((1, 3), 0.7, requires_grad=True)
-    darker = torch.full((1, 3), 0.4, requires_grad=True)
-    for predicted in (brighter, darker):
-        photometric(predicted, observed, exposure).backward()
-    assert (brighter.grad == 0).all() and (darker.grad < 0).all()
-    assert photometric(brighter, observed) > 0, "where exposures are equal nothing is brighter than white"
-
-
 def test_exposures_travel_with_a_checkpoint(manager):
     model, other = Exposures(manager.priors.gains), Exposures(None)
     other.load_state_dict(model.state_dict())
@@ -125,9 +97,3 @@ def test_exposures_travel_with_a_checkpoint(manager):
     fresh = Exposures(None)
     fresh.load_state_dict({})
     assert fresh.mean is None
-
-
-def test_metrics_name_both_scores():
-    image = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(1))
-    values = ImageMetrics("none")(0.8 * image, image)
-    assert values["cc_psnr"] > values["psnr"] + 10

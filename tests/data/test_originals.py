@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
@@ -65,38 +64,10 @@ def test_copies_that_are_cut_are_told_from_those_of_the_whole_image(tmp_path, by
     assert views.intrinsics[0] == pytest.approx([180.5 * x, 181.5 * y, 152.25 * x, 43.5 * y])
 
 
-def test_a_copy_that_was_rounded_up_has_the_same_original_though_its_camera_was_rounded_down(tmp_path):
-    original = write(tmp_path / "images/x.png", 1242, 375)
-    copy = write(tmp_path / "images_4/x.png", 311, 94)
-    views = at_full_size(posed(copy, 310, 93))
-    x, y = 1242 / 311, 375 / 94
-    assert views.files == (original,)
-    assert views.intrinsics[0] == pytest.approx([180.5 * x, 181.5 * y, 152.25 * x, 43.5 * y])
-
-
 def test_an_image_that_is_reduced_when_it_is_read_keeps_its_angles(tmp_path):
     file = write(tmp_path / "x.png", 1240, 372)
     views = at_full_size(posed(file, 310, 93))
     assert views.sizes.tolist() == [[1240, 372]] and views.intrinsics[0] == pytest.approx([722, 726, 609, 174])
-
-
-def test_an_image_without_an_original_is_its_own(tmp_path):
-    lone = write(tmp_path / "images_4/x.png", 310, 93)
-    for file in (lone, write(tmp_path / "other/x.png", 310, 93)):
-        found = at_full_size(posed(file, 310, 93))
-        assert found.files == (file,) and found.sizes.tolist() == [[310, 93]]
-        assert found.intrinsics.tolist() == [[180.5, 181.5, 152.25, 43.5]]
-
-
-def test_a_file_of_that_name_but_of_another_shape_is_no_original(tmp_path):
-    write(tmp_path / "images/x.png", 1242, 700)
-    copy = write(tmp_path / "images_4/x.png", 310, 93)
-    assert at_full_size(posed(copy, 310, 93)).files == (copy,)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"x\.png cannot be read"):
-        at_full_size(posed(tmp_path / "x.png", 4, 4))
 
 
 def transforms(folder: Path) -> Callable[[int], DataParserConfig]:
@@ -146,10 +117,3 @@ def test_cameras_of_copies_look_where_those_of_the_originals_do(tmp_path, size, 
             for i in range(len(c))
         ]
         assert np.ptp(np.array(tangents), axis=0) == pytest.approx([0, 0], abs=1e-6)
-
-
-def test_cameras_of_copies_without_originals_stay(tmp_path):
-    file = write(tmp_path / "images_4/x.png", 310, 93)
-    camera = Cameras(torch.eye(4)[None, :3], 180.5, 181.5, 152.25, 43.5, 310, 93)
-    outputs = DataparserOutputs([file, tmp_path / "images_4/missing.png"], camera)
-    assert float(fit_cameras(outputs, 4).cameras.fx) == 180.5

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.scannet_dataparser import ScanNetDataParserConfig
 from PIL import Image
 from tiny_scene import FOCAL, HEIGHT, TEST, TRAIN, WIDTH, color_of, name_of, pixel_rays, pose_of, write_scene
 from training_runs import datamanager, in_capture_frame, ready, trainer_config
-
-from mmpi_ns.utils.errors import InputError
 
 STEPS = 80
 
@@ -187,20 +184,3 @@ def test_every_kind_of_scene_is_trained_and_evaluated(capture, tmp_path):
     image = trainer.pipeline.datamanager.eval_dataset[0]["image"][..., :3]
     assert metrics["psnr"] > -10 * np.log10(float(image.var(dim=(0, 1)).mean())) + 2
     assert metrics["dropped_mass"] < 0.2
-
-
-def test_the_only_test_image_of_instant_ngp_is_named(tmp_path):
-    data = write_scene(tmp_path / "data")
-    edit(data, lambda meta: [meta.pop(key, None) for key in ("train_filenames", "val_filenames", "test_filenames")])
-    with pytest.raises(InputError, match=r"loses the pose of .*, the only image of its split"):
-        datamanager(data, dataparser=InstantNGPDataParserConfig(train_split_fraction=0.8))
-    two = datamanager(data, dataparser=InstantNGPDataParserConfig(train_split_fraction=0.7))
-    assert two.eval_dataset.cameras.shape == (2,)
-
-
-def test_missing_test_images_are_named_before_the_training_images_are_matched(tmp_path, capsys):
-    data = write_scene(tmp_path / "data", sfm=False)
-    (data / "images" / name_of(TEST[1])).unlink()
-    with pytest.raises(InputError, match=f"Image .*{name_of(TEST[1])} cannot be read"):
-        datamanager(data)
-    assert "matching" not in capsys.readouterr().out

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 import torch
 from hand_made import make_mpi
-from random_fields import bundle, fill, random_field, random_plan, random_rays, render, sampled
+from random_fields import bundle, fill, random_plan, random_rays, render, sampled
 from random_scenes import dense_grad
 
 from mmpi_ns.blending import log_shares
@@ -111,17 +109,6 @@ def test_growing_keeps_texels_that_both_resolutions_share():
     new = block(field, 0)
     assert np.allclose(new[:, ::2, ::2], old, atol=1e-6)
     assert np.allclose(new[:, ::2, 1::2], (old[:, :, 1:] + old[:, :, :-1]) / 2, atol=1e-6)
-
-
-def test_growing_marks_a_texel_as_trained_when_one_that_it_came_from_was():
-    plan = one_mpi(planes=2, height=8, width=8)
-    field = MMPIField(plan)
-    field.build(plan, 1 / 4)
-    field.touched[field.grids[0].nearest(torch.tensor([[-1.0, -1.0, -1.0]]))] = 1
-    field.grow(1.0)
-    grown = field.touched[field.grids[0].rows].view(2, 8, 8)
-    assert grown[0, 0, 0] == 1 and grown[0, 2, 2] == 1
-    assert grown[0, 3:].sum() == 0 and grown[0, :, 3:].sum() == 0 and grown[1].sum() == 0
 
 
 def test_released_texels_are_empty_and_the_others_stay_as_they_are(plan):
@@ -295,28 +282,11 @@ def test_a_state_dict_brings_its_own_plan_and_resolution(ours, theirs, factor):
     assert torch.equal(a.rgb, b.rgb) and torch.equal(a.samples.live, b.samples.live) and a.samples.live.any()
 
 
-def test_a_plan_written_before_a_field_was_added_loads_and_stays_as_it_was_written(plan):
-    state = MMPIField(plan).state_dict()
-    text = json.loads(plan.to_json())
-    for mpi in text["mpis"]:
-        del mpi["far"]
-    old = torch.frombuffer(bytearray(json.dumps(text).encode()), dtype=torch.uint8)
-    read = MMPIField(plan)
-    read.load_state_dict({**state, "plan_bytes": old})
-    assert read.full_plan == plan and torch.equal(read.plan_bytes, old)
-
-
 def test_a_state_dict_without_a_plan_is_refused(plan):
     state = MMPIField(plan).state_dict()
     del state["plan_bytes"]
     with pytest.raises(ValueError, match="no scene plan"):
         MMPIField(plan).load_state_dict(state)
-
-
-def test_filling_a_random_field_sets_the_depths_it_says():
-    field = random_field(2, True, seed=0)
-    tau = render(field, bundle(*random_rays(field.plan, 20, seed=0))).composite
-    assert tau.weights.max() > 0.1 and torch.isfinite(tau.weights).all()
 
 
 def test_tables_in_half_precision_stay_finite_and_nothing_else_changes():

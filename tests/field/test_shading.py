@@ -51,10 +51,6 @@ def shaded_by_hand(networks, mean, direction):
     return 1 / (1 + np.exp(-(np.log(mean[:3] / (1 - mean[:3])) + 8 * np.tanh(change / 2))))
 
 
-class RawTexels(OracleRay):
-    """An oracle's ray whose samples have their interpolated texels for colours."""
-
-
 @pytest.fixture()
 def raw_texels(monkeypatch):
     monkeypatch.setattr("random_fields._color", lambda networks, k, features, ndc, direction: features)

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
 import pytest
 import torch
 import torchmetrics.image.lpip
-from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.model_components import renderers
 from random_scenes import dense_grad
 from tiny_scene import HEIGHT, WIDTH, write_scene
-from training_runs import plan_of, ready, trainer_config, write_plan
+from training_runs import ready, trainer_config, write_plan
 
 import mmpi_ns.model
-from mmpi_ns import model as mmpi_model
 from mmpi_ns.config import mmpi_small
-from mmpi_ns.training import losses
-from mmpi_ns.training.losses import TV_EVERY
 from mmpi_ns.training.phases import TRAINS
 
 KINDS = ("density", "features", "colour", "reliability")
@@ -83,27 +77,6 @@ def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file,
             assert torch.isfinite(groups[k][0].grad).all()
 
 
-def test_total_variation_is_added_every_few_steps_while_densities_train(scene, plan_file, tmp_path):
-    trainer = trainer_of(scene, plan_file, tmp_path)
-    blend = trainer.pipeline.model.progress.schedule.phases[1].start
-    assert [("tv" in run_step(trainer, s)[1]) for s in (0, 1, TV_EVERY)] == [True, False, True]
-    assert "tv" not in run_step(trainer, -(-blend // TV_EVERY) * TV_EVERY)[1]
-
-
-def test_the_densest_planes_decide_how_exact_a_depth_priors_can_be(scene, tmp_path, monkeypatch):
-    plan = write_plan(scene, tmp_path / "plan.json", num_mpis=2)
-    words = json.loads(plan.read_text())
-    words["mpis"][1]["planes"] = 2
-    plan.write_text(json.dumps(words))
-    targets, sums = [], losses.depth_sums
-    monkeypatch.setattr(losses, "depth_sums", lambda *tensors: targets.append(tensors[4]) or sums(*tensors))
-    run_step(trainer_of(scene, plan, tmp_path, training="joint"), 0)
-    spacing = 1 / (words["mpis"][0]["near"] * (words["mpis"][0]["planes"] - 1))
-    assert spacing < 0.2 / words["mpis"][1]["near"]
-    of_pixels = targets[0][:64, 1]  # keypoints have windows of their own
-    assert of_pixels.min().item() == pytest.approx(0.6 * spacing, rel=1e-2)
-
-
 def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_file, tmp_path):
     trainer = trainer_of(scene, plan_file, tmp_path, sampling__threshold=0.0)
 
@@ -131,18 +104,6 @@ def test_with_rays_per_mpi_all_every_mpi_renders_every_ray_alone_with_the_cube(s
     assert all(torch.isfinite(v) for v in losses.values())
 
 
-def test_three_equal_mpis_that_render_all_rays_have_the_losses_of_one(scene, tmp_path, trained):
-    one = plan_of(trained.pipeline.datamanager.observations, num_mpis=1)
-    losses = []
-    for count in (1, 3):
-        mpis = tuple(one.mpis[0].__class__(**{**vars(one.mpis[0]), "name": f"mpi{k}"}) for k in range(count))
-        path = tmp_path / f"{count}.json"
-        path.write_text(one.__class__(mpis, None, one.ray_near, one.content_near).to_json())
-        losses.append(run_step(trainer_of(scene, path, tmp_path / str(count), rays_per_mpi="all"), 0)[1])
-    for name in ("rgb_loss", "point_color", "distortion", "keypoint_depth"):
-        assert losses[1][name].item() == pytest.approx(losses[0][name].item(), rel=1e-2), name
-
-
 def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path):
     plan = write_plan(scene, tmp_path / "plan.json", num_mpis=1)
     trainer = trainer_of(scene, plan, tmp_path, training="two-phase")
@@ -152,23 +113,6 @@ def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path)
     for step in (0, 12, 23):
         _, losses, _ = run_step(trainer, step)
         assert all(torch.isfinite(v) for v in losses.values())
-
-
-def test_the_weight_of_depth_priors_falls_with_the_rates(scene, plan_file, tmp_path, monkeypatch):
-    trainer, weights = trainer_of(scene, plan_file, tmp_path, training="joint"), []
-    real = mmpi_ns.model.batch_losses
-
-    def recorded(*args):
-        weights.append(args[3].depth_priors * float(args[6]))
-        return real(*args)
-
-    monkeypatch.setattr(mmpi_ns.model, "batch_losses", recorded)
-    model = trainer.pipeline.model
-    half, last = model.progress.schedule.total_steps // 2, model.progress.schedule.total_steps - 1
-    for step in (0, half, last):
-        run_step(trainer, step)
-    fallen = 10.0 ** -((last / (2 * half) - 0.5) / 0.5)
-    assert weights == pytest.approx([0.01, 0.01, 0.01 * fallen])
 
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
@@ -208,62 +152,7 @@ def test_training_lowers_the_error(trained, model):
     assert error < 0.7 * batch["image"].var(), "no better than one colour for all"
 
 
-def test_an_evaluation_batch_during_training_has_a_loss(trained):
-    _, losses, metrics = trained.pipeline.get_eval_loss_dict(step=3)
-    assert set(losses) == {"rgb_loss"} and torch.isfinite(losses["rgb_loss"]) and metrics["psnr"] > 5
-
-
 # Rendering -----------------------------------------------------------------------------------------------------------
-
-
-def test_outputs_are_one_row_a_ray(model, camera):
-    rays = camera.generate_rays(0, keep_shape=False)
-    outputs = model(rays)
-    shapes = {name: tuple(value.shape) for name, value in outputs.items()}
-    count = WIDTH * HEIGHT
-    assert shapes == {"rgb": (count, 3)} | {
-        name: (count, 1) for name in ("accumulation", "depth", "winning_mpi", "texel_pixels", "dropped_mass")
-    }
-    assert all(torch.isfinite(v).all() for v in outputs.values())
-    assert 0 <= outputs["rgb"].min() and outputs["rgb"].max() <= 1 and outputs["accumulation"].max() <= 1
-    assert outputs["dropped_mass"].max() < 0.3 and (outputs["depth"] > 0).all()
-
-
-@pytest.mark.parametrize("threshold", [0.0, 1e-3])
-def test_pictures_do_not_depend_on_the_chunk_size(model, camera, monkeypatch, threshold):
-    monkeypatch.setattr(model.config.rendering, "threshold", threshold)
-    found = []
-    for size in (WIDTH * HEIGHT, 100, 17):
-        monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", size)
-        found.append(model.get_outputs_for_camera(camera))
-    for other in found[1:]:
-        for name in ("rgb", "accumulation", "dropped_mass"):
-            assert torch.allclose(found[0][name], other[name], atol=1e-5), name
-        # Half of the mass may be reached a plane earlier where rounding decides.
-        assert ((found[0]["depth"] - other["depth"]).abs() < 1e-3 * other["depth"]).float().mean() > 0.995
-        assert (found[0]["winning_mpi"] == other["winning_mpi"]).float().mean() > 0.995
-
-
-def test_chunks_have_the_size_that_suits_the_device_unless_another_is_asked_for(model, camera, monkeypatch):
-    sizes = []
-    monkeypatch.setattr(mmpi_model, "rays_per_chunk", lambda *_: 100)
-    render = model.window_outputs
-    monkeypatch.setattr(
-        model, "window_outputs", lambda w, field, rays, *more: sizes.append(len(rays)) or render(w, field, rays, *more)
-    )
-    for asked, expected in ((0, 100), (17, 17)):
-        sizes.clear()
-        monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", asked)
-        model.get_outputs_for_camera(camera)
-        assert max(sizes) == expected and sum(sizes) == WIDTH * HEIGHT
-        assert model.config.eval_num_rays_per_chunk == asked
-
-
-def test_depth_is_the_distance_along_the_ray_and_finite_at_infinity(model, camera):
-    outputs = model.get_outputs_for_camera(camera)
-    plan = model.field.plan
-    farthest = 10 * max(m.near * (m.planes - 1) for m in plan.mpis)
-    assert outputs["depth"].max() <= farthest * 1.001 and outputs["depth"].min() >= plan.ray_near
 
 
 @pytest.mark.parametrize(("near", "far"), [(0.5, 3.0), (3.0, 5.0), (4.0, math.inf)])
@@ -289,33 +178,6 @@ def test_a_crop_shows_the_background_around_a_box(model, camera):
     assert (cropped["accumulation"][misses] == 0).all() and (cropped["rgb"][misses] == 0.5).all()
     assert cropped["accumulation"][~misses].max() > 0.05 and torch.isfinite(cropped["depth"]).all()
     assert (cropped["accumulation"] <= outputs["accumulation"] + 1e-4).all()
-
-
-def test_a_colour_asked_for_by_the_viewer_or_a_crop_is_the_background(model, camera):
-    rays = camera.generate_rays(0, keep_shape=False)
-    rays.nears = rays.fars = torch.full_like(rays.pixel_area, 1e10)
-    assert (model(rays)["rgb"] == 0.5).all()
-    with renderers.background_color_override_context(torch.tensor([1.0, 0.0, 0.25])):
-        assert torch.equal(model(rays)["rgb"], torch.tensor([[1.0, 0.0, 0.25]]).expand(len(rays), 3))
-
-
-def test_a_picture_with_transparency_can_be_asked_for(model, camera):
-    outputs = model.get_outputs_for_camera(camera)
-    rgba = model.get_rgba_image(outputs)
-    assert rgba.shape == (HEIGHT, WIDTH, 4) and torch.equal(rgba[..., 3:], outputs["accumulation"])
-    over_gray = rgba[..., :3] * rgba[..., 3:] + 0.5 * (1 - rgba[..., 3:])
-    assert torch.allclose(over_gray, outputs["rgb"], atol=1e-4)
-
-
-def test_a_bare_ray_bundle_is_rendered(model):
-    """As ns-render's nearest camera passes it: no metadata, one ray, finite far."""
-    one = torch.ones(1, 1)
-    rays = RayBundle(
-        origins=torch.zeros(1, 3), directions=torch.tensor([[0.0, 1.0, 0.0]]), pixel_area=one,
-        nears=0.05 * one, fars=100 * one, camera_indices=one.long(), metadata={},
-    )  # fmt: skip
-    outputs = model.get_outputs(rays)
-    assert outputs["depth"].shape == (1, 1) and torch.isfinite(outputs["rgb"]).all()
 
 
 def test_the_viewer_can_show_one_mpi_alone(model, camera):
@@ -346,7 +208,40 @@ def test_the_winning_mpi_is_the_one_that_gives_most_of_the_light(model, camera):
             assert (outputs["winning_mpi"] == k).float().mean() > 0.9
 
 
-# Metrics -------------------------------------------------------------------------------------------------------------
+# A checkpoint's own plan ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("training", ["joint", "two-phase"])
+def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
+    scene, plan_file, tmp_path, camera, training
+):
+    """As in evaluation without the images: placement finds less there, so K differs until the checkpoint is read."""
+    trained = trainer_of(scene, plan_file, tmp_path, steps=8, training=training).pipeline.model.eval()
+    other = write_plan(scene, tmp_path / "other.json", num_mpis=1, planes=20)
+    read = trainer_of(scene, other, tmp_path, steps=8, training=training).pipeline.model.eval()
+    read.load_state_dict(trained.state_dict())
+    for name in ("rgb", "accumulation", "depth"):
+        expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
+        assert torch.equal(expected, found), name
+    assert read.show.options == ["all", *trained.field.full_plan.names]
+    assert read.blends(read.field) == trained.blends(trained.field)
+
+
+def test_the_weight_of_depth_priors_falls_with_the_rates(scene, plan_file, tmp_path, monkeypatch):
+    trainer, weights = trainer_of(scene, plan_file, tmp_path, training="joint"), []
+    real = mmpi_ns.model.batch_losses
+
+    def recorded(*args):
+        weights.append(args[3].depth_priors * float(args[6]))
+        return real(*args)
+
+    monkeypatch.setattr(mmpi_ns.model, "batch_losses", recorded)
+    model = trainer.pipeline.model
+    half, last = model.progress.schedule.total_steps // 2, model.progress.schedule.total_steps - 1
+    for step in (0, half, last):
+        run_step(trainer, step)
+    fallen = 10.0 ** -((last / (2 * half) - 0.5) / 0.5)
+    assert weights == pytest.approx([0.01, 0.01, 0.01 * fallen])
 
 
 @pytest.mark.parametrize("error", [OSError("no route"), RuntimeError("broken file"), ModuleNotFoundError("lpips")])
@@ -374,22 +269,3 @@ def test_lpips_is_left_out_with_a_message_where_its_weights_are_not_available(
     for name, image in images.items():
         assert image.shape == (HEIGHT, WIDTH * (2 if name == "img" else 1), 3), name
         assert image.min() >= 0 and image.max() <= 1
-
-
-# A checkpoint's own plan ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("training", ["joint", "two-phase"])
-def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
-    scene, plan_file, tmp_path, camera, training
-):
-    """As in evaluation without the images: placement finds less there, so K differs until the checkpoint is read."""
-    trained = trainer_of(scene, plan_file, tmp_path, steps=8, training=training).pipeline.model.eval()
-    other = write_plan(scene, tmp_path / "other.json", num_mpis=1, planes=20)
-    read = trainer_of(scene, other, tmp_path, steps=8, training=training).pipeline.model.eval()
-    read.load_state_dict(trained.state_dict())
-    for name in ("rgb", "accumulation", "depth"):
-        expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
-        assert torch.equal(expected, found), name
-    assert read.show.options == ["all", *trained.field.full_plan.names]
-    assert read.field.blends == trained.field.blends

@@ -77,11 +77,6 @@ def test_a_checkpoint_with_other_refinement_is_refused(whole, scene, plan_file, 
         ready(config, load_dir=folder, load_step=1)
 
 
-def test_poses_stay_without_being_asked_for(scene, plan_file, tmp_path):
-    model = ready(trainer_config(scene, plan_file, tmp_path)).pipeline.model
-    assert not list(model.camera_optimizer.parameters()) and "camera_opt" not in model.get_param_groups()
-
-
 def test_exported_cameras_are_the_given_ones_with_their_corrections(whole, monkeypatch):
     """What ``ns-export cameras`` writes of a run, as it loads it."""
     monkeypatch.setitem(sys.modules, "open3d", MagicMock())  # cannot be imported everywhere, and has no part in this

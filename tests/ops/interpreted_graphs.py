@@ -1,4 +1,4 @@
-"""Recorded steps beside steps one operation at a time, on the GPU's path: run like ops/interpreted_march.py."""
+"""Recorded steps beside steps one operation at a time, on the GPU's path: run like interpreted.py."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from mmpi_ns.training import step_graph
 from mmpi_ns.training.step_graph import MEASURED, StepGraphs
 
 STEPS = 16
-MOST_NODES = 700
-"""Kernels of a recorded half of a step at most: 13 heads' worth of networks would be more."""
 
 
 def prepared(scene, plan_file, folder, training="joint", shading="ray", recorder=None):
@@ -49,7 +47,7 @@ def prepared(scene, plan_file, folder, training="joint", shading="ray", recorder
     return run, graphs, recorder
 
 
-@pytest.mark.parametrize(("training", "shading"), [("joint", "ray"), ("two-phase", "ray"), ("two-phase", "sample")])
+@pytest.mark.parametrize(("training", "shading"), [("joint", "ray"), ("two-phase", "sample")])
 def test_recorded_steps_train_what_steps_one_operation_at_a_time_do(scene, plan_file, tmp_path, training, shading):
     run, graphs, recorder = prepared(scene, plan_file, tmp_path / "a", training, shading)
     plain, by_operations, _ = prepared(scene, plan_file, tmp_path / "b", training, shading)
@@ -63,9 +61,7 @@ def test_recorded_steps_train_what_steps_one_operation_at_a_time_do(scene, plan_
         torch.testing.assert_close(a.data, b.data, rtol=1e-3, atol=1e-4)
     assert not graphs.is_off and not graphs.lost and by_operations.repeated == 0
     assert graphs.repeated >= STEPS - 5 * MEASURED
-    print(training, shading, "kernels of the halves of recorded steps:", [tape.nodes for tape in recorder.tapes])
     assert not any(tape.waits for tape in recorder.tapes)
-    assert all(tape.nodes <= MOST_NODES for tape in recorder.tapes)
 
 
 def test_a_step_that_does_not_fit_changes_nothing_and_the_next_one_has_room(scene, plan_file, tmp_path):

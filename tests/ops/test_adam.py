@@ -9,10 +9,9 @@ import torch
 from compiled import both, compiled, normal  # noqa: F401
 from torch.nn import Parameter
 
-from mmpi_ns.ops.adam import AdamConstants, adam_rows
-from mmpi_ns.ops.interpolate import Table, interpolate, read_rows
+from mmpi_ns.ops.interpolate import Table, read_rows
 from mmpi_ns.scene.texels import BRICK
-from mmpi_ns.training.touched_adam import TouchedAdam, TouchedAdamConfig
+from mmpi_ns.training.touched_adam import TouchedAdam
 
 SETTINGS = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-8}
 
@@ -68,13 +67,6 @@ def test_everything_touched_equals_torchs_adam(layout, parts, dtype, error):
     assert not torch.equal(param[-8:], table(dtype=dtype))
 
 
-def test_first_step_moves_every_touched_entry_by_the_learning_rate():
-    param = Parameter(torch.zeros(2, 2, dtype=torch.float64))
-    param.grad = torch.tensor([[3.0, -0.001], [0.0, 5e4]], dtype=torch.float64)
-    TouchedAdam([param], lr=0.1).step()
-    assert torch.allclose(param, torch.tensor([[-0.1, 0.1], [0.0, -0.1]], dtype=torch.float64), atol=2e-6)
-
-
 @pytest.mark.parametrize("layout", ["dense", "rows"])
 def test_untouched_rows_keep_every_bit_and_their_moments(layout):
     param = parameter(layout)
@@ -124,17 +116,6 @@ def test_parts_that_cancel_touch_nothing():
     assert torch.equal(param, before)
 
 
-def test_rows_and_a_dense_gradient_of_the_same_batch_give_the_same_step():
-    dense, rows = parameter("dense"), parameter("rows")
-    optimizers = [TouchedAdam([p], **SETTINGS) for p in (dense, rows)]
-    for grad in gradients((8, 3), 5):
-        kept = (torch.rand(8, generator=torch.Generator().manual_seed(3)) < 0.5).nonzero()[:, 0].tolist()
-        for param, optimizer in zip((dense, rows), optimizers, strict=True):
-            give(param, grad[kept], kept)
-            optimizer.step()
-    assert torch.allclose(dense, rows[-8:], rtol=1e-14) and not torch.equal(dense, table())
-
-
 def test_bias_correction_follows_the_count_of_steps_not_of_touches():
     """As in DVGO: a texel first touched at step 3 is corrected as if it had been there all along."""
     param = Parameter(torch.zeros(2, 1, dtype=torch.float64))
@@ -144,14 +125,6 @@ def test_bias_correction_follows_the_count_of_steps_not_of_touches():
     mean, square = 0.1, 0.01
     wanted = 0.1 * (mean / (1 - 0.9**3)) / ((square / (1 - 0.99**3)) ** 0.5 + 1e-8)
     assert param[1].item() == pytest.approx(-wanted)
-
-
-def test_parameters_without_gradient_stay_bit_identical():
-    frozen, moving = Parameter(table()), Parameter(table())
-    optimizer = TouchedAdam([frozen, moving], **SETTINGS)
-    run(moving, gradients((8, 3), 3), optimizer)
-    assert torch.equal(frozen, table()) and frozen not in optimizer.state
-    assert not torch.equal(moving, table())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -186,32 +159,6 @@ def test_moments_follow_the_bricks_that_are_kept():
     assert torch.equal(state["moments"], torch.cat([before["moments"][:BRICK], before["moments"][2 * BRICK :]]))
     assert state["step"] == before["step"]
     optimizer.keep_bricks(Parameter(torch.zeros(4, 1)), kept)  # one that was never seen
-
-
-def test_forgotten_moments_start_afresh():
-    param = Parameter(table())
-    optimizer = TouchedAdam([param], **SETTINGS)
-    run(param, gradients((8, 3), 3), optimizer)
-    optimizer.state.pop(param)
-    param.data = torch.zeros(20, 3, dtype=torch.float64)  # grown
-    param.grad = torch.ones(20, 3, dtype=torch.float64)
-    optimizer.step()
-    assert torch.allclose(param, torch.full_like(param, -0.1))
-
-
-def test_tiny_and_huge_gradients_give_finite_steps():
-    param = Parameter(torch.zeros(4, 1))
-    optimizer = TouchedAdam([param], **SETTINGS)
-    run(param, [torch.tensor([[1e-30], [1e-12], [1e12], [1e18]])] * 3, optimizer)
-    assert torch.isfinite(param).all() and (param.abs() <= 0.31).all()
-
-
-def test_config_builds_the_optimizer_with_its_settings():
-    param = Parameter(table())
-    optimizer = TouchedAdamConfig(lr=0.02).setup(params=[param])
-    group = optimizer.param_groups[0]
-    assert isinstance(optimizer, TouchedAdam)
-    assert (group["lr"], group["betas"], group["eps"]) == (0.02, (0.9, 0.99), 1e-8)
 
 
 @pytest.mark.parametrize("channels", [8, 9])
@@ -251,49 +198,5 @@ def test_steps_that_are_left_to_other_threads_have_the_same_bits(compiled, three
     assert all(torch.equal(a, b) for a, b in zip(trained(3), trained(1), strict=True))
 
 
-TAPS = torch.zeros(5, 4, dtype=torch.int64), torch.ones(5, 4)
-"""Rows and weights of samples."""
-
-
-class Unfinished:
-    def __init__(self):
-        self.times = 0
-
-    def finish(self):
-        self.times += 1
-
-
-@pytest.mark.parametrize(
-    "read",
-    [
-        lambda param, _: param.data,
-        lambda param, _: param.detach(),
-        lambda param, _: setattr(param, "data", torch.zeros(500, 8)),
-        lambda param, _: read_rows(param, torch.arange(5)),
-        lambda param, _: interpolate(param, *TAPS),
-        lambda param, _: interpolate(param.requires_grad_(False), *TAPS),
-        lambda _, optimizer: optimizer.state_dict(),
-        lambda param, optimizer: optimizer.keep_bricks(param, torch.arange(2)),
-        lambda _, optimizer: optimizer.step(),
-    ],
-)
-def test_whatever_reads_a_table_or_its_moments_waits_for_the_step(read):
-    param = Table(normal(512, 8))
-    optimizer = TouchedAdam([param], lr=0.1)
-    param.add_grad(torch.arange(64, 512), normal(448, 8))
-    optimizer.step()
-    param.pending = unfinished = Unfinished()
-    read(param, optimizer)
-    assert unfinished.times == 1 and param.pending is not unfinished
-
-
 def chosen_rows(count, chosen, seed):
     return torch.randperm(count, generator=torch.Generator().manual_seed(seed))[:chosen].sort().values
-
-
-@pytest.mark.parametrize("shapes", [((9, 2), (9, 2), (4,), (4, 2)), ((9, 2), (9, 2, 2), (4,), (5, 2)),
-                                    ((9, 2), (8, 2, 2), (4,), (4, 2)), ((9,), (9, 2), (4,), (4,))])  # fmt: skip
-def test_arrays_of_a_wrong_shape_are_refused(shapes):
-    param, moments, rows, grad = (torch.zeros(shape) for shape in shapes)
-    with pytest.raises(ValueError, match="has the shape"):
-        adam_rows(param, moments, rows.long(), grad, AdamConstants(0.9, 0.99, 1.0, 1e-8, 0.1))

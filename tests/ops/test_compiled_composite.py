@@ -75,22 +75,3 @@ def test_colours_of_rays_and_their_gradients_equal_float64():
         found.append((rgb.detach(), weights.grad, own.grad))
     for a, b in zip(*found, strict=True):
         assert b.abs().max() > 0.1 and ((a.double() - b).abs() <= 2e-5 * b.abs() + 2e-6).all()
-
-
-def test_without_rays_or_slots_nothing_is_gathered():
-    for rays, slots in ((0, 5), (3, 1)):
-        given = torch.zeros(rays, slots), torch.zeros(rays, slots, dtype=torch.bool), torch.zeros(rays, slots)
-        made = composite.composite_weights(*given, torch.zeros(rays, 1))
-        assert made.weights.shape == (rays, slots) and not made.accumulation.any()
-        assert composite.render_colors(made, torch.ones(rays, slots, 3)).tolist() == [[0.0] * 3] * rays
-
-
-def test_rays_do_not_depend_on_the_number_of_threads():
-    given, threads, found = batch(rays=1500), torch.get_num_threads(), []
-    for count in (1, 3):
-        try:
-            torch.set_num_threads(count)
-            found.append(weights_and_gradient(composite.composite_weights, given, torch.float32))
-        finally:
-            torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))

@@ -78,11 +78,6 @@ def test_sums_and_gradients_equal_the_double_loops(form, case):
     np.testing.assert_allclose(gradient.numpy()[valid], expected[valid], rtol=3e-3, atol=3e-5)
 
 
-def test_the_compiled_form_is_the_one_that_runs():
-    weights = torch.zeros(3, 4)
-    assert dispatch.form_of("depth_sums", weights) == "cpu"
-
-
 def test_threads_do_not_change_the_sums(monkeypatch):
     *arrays, scale = rays(count=2000)
     tensors = [torch.from_numpy(x) if x.dtype == bool else torch.from_numpy(x).float() for x in arrays]
@@ -90,12 +85,3 @@ def test_threads_do_not_change_the_sums(monkeypatch):
     monkeypatch.setattr("mmpi_ns.ops.build.num_threads", lambda: 3)
     several = depth_sums(*tensors, scale)
     assert all(torch.equal(a, b) for a, b in zip(one, several, strict=True))
-
-
-@pytest.mark.parametrize("wrong", range(5))
-def test_wrong_shapes_are_refused(wrong):
-    *arrays, scale = rays()
-    tensors = [torch.from_numpy(x) if x.dtype == bool else torch.from_numpy(x).float() for x in arrays]
-    tensors[wrong] = tensors[wrong][:-1]
-    with pytest.raises(ValueError, match="has the shape"):
-        depth_sums(*tensors, scale)

@@ -83,37 +83,6 @@ def test_reference_gradients_are_finite_differences():
     assert torch.autograd.gradcheck(moments, (values,))
 
 
-@pytest.mark.parametrize("form", [gather_taps, gather_taps.reference])
-def test_moments_hold_the_weights_fixed(form):
-    values, groups, slots, weights, wanted = in_float32(batch(9))
-    weights.requires_grad_()
-    sums = form(values.requires_grad_(), groups, slots, weights, wanted)
-    grad = torch.autograd.grad(sums.first.sum() + sums.second.sum(), weights, allow_unused=True)[0]
-    assert not sums.mass.requires_grad and (grad is None or not grad.any())
-
-
-def test_values_that_do_not_train_get_no_gradient_and_weights_do():
-    values, groups, slots, weights, wanted = in_float32(batch(9))
-    exact = with_gradients(gather_taps.reference, batch(9), [torch.ones(7, n) for n in (9, 1, 3, 3)])[-1]
-    gather_taps(values, groups, slots, weights.requires_grad_(), wanted).gathered.sum().backward()
-    assert values.grad is None and (weights.grad - exact).abs().max() < 1e-5
-
-
-@pytest.mark.parametrize("threads", [1, 2, 5])
-def test_bits_do_not_depend_on_threads(threads, monkeypatch):
-    monkeypatch.setattr("mmpi_ns.ops.gather.AT_LEAST", 1000)
-    given = in_float32(batch(9, rays=1500))
-    upstream = [torch.randn(1500, n, generator=torch.Generator().manual_seed(1)) for n in (9, 1, 3, 3)]
-    one = with_gradients(gather_taps, given, upstream)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(threads)
-        for a, b in zip(with_gradients(gather_taps, given, upstream), one, strict=True):
-            assert torch.equal(a, b)
-    finally:
-        torch.set_num_threads(before)
-
-
 # At places -----------------------------------------------------------------------------------------------------------
 
 
@@ -134,13 +103,6 @@ def test_at_places_sums_are_those_at_their_taps(with_cube):
 
 
 # Hard inputs ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("form", [gather_taps, gather_taps.reference])
-def test_no_samples_gather_nothing(form):
-    weights = torch.zeros(3, 2, requires_grad=True)
-    sums = form(torch.zeros(0, 9), [], torch.zeros(0, dtype=torch.int64), weights, torch.ones(3, dtype=torch.bool))
-    assert all(s.shape[0] == 3 and not s.any() for s in parts_of(sums))
 
 
 @pytest.mark.parametrize("form", [gather_taps, gather_taps.reference])

@@ -11,7 +11,6 @@ import torch
 from gpu_parts import interpret
 from random_fields import bundle, random_field, random_rays, render
 from triton_processes import HERE, needs_triton, python
-from waits import TRAININGS, counted_on_a_gpu, waits_of_phases
 
 from mmpi_ns.ops import dispatch
 
@@ -19,59 +18,25 @@ from mmpi_ns.ops import dispatch
 @needs_triton
 def test_kernels_by_the_interpreter():
     """The variable must be set before Triton is imported, so these tests have a process of their own."""
-    files = [str(HERE / "ops" / f"interpreted_{part}.py") for part in ("march", "rows", "sums", "show", "steps")]
-    found = python("-m", "pytest", "-p", "no:cacheprovider", *files, TRITON_INTERPRET="1")
+    file = str(HERE / "ops" / "interpreted.py")
+    found = python("-m", "pytest", "-p", "no:cacheprovider", file, TRITON_INTERPRET="1")
     assert found.returncode == 0, found.stdout[-6000:] + found.stderr[-2000:]
     passed = re.search(r"(\d+) passed", found.stdout)
     assert passed and int(passed[1]) > 30 and "skipped" not in found.stdout, found.stdout[-500:]
 
 
 @needs_triton
-def test_kernels_are_launched_on_the_device_of_their_tensors(monkeypatch):
-    """Two GPUs by reading what is passed: tensors say that they are on the second one, the current one is the first."""
-    from mmpi_ns.ops.gpu_scene import launch
+@pytest.mark.parametrize("architecture", [75, 90])
+def test_kernels_compile_without_spilling_registers(monkeypatch, architecture):
+    """For the oldest and the newest GPU. The interpreter takes what the compiler does not: types, shapes, control
+    flow."""
+    from triton_compiling import all_launches, largest_launches, spills
 
-    class OnSecond(torch.Tensor):
-        is_cuda = True
-
-        def get_device(self):
-            return 1
-
-    current = [0]
-
-    def exchange(device):
-        before, current[0] = current[0], device
-        return before
-
-    for name in ("_exchange_device", "_maybe_exchange_device"):
-        monkeypatch.setattr(torch.cuda, name, exchange)
-    launches = []
-    kernel = {(2,): lambda *given, **constants: launches.append(current[0])}
-    launch(kernel, 3, 2, OnSecond(torch.zeros(3)), 3)
-    assert launches == [1] and current == [0]
-    launch(kernel, 0, 2, OnSecond(torch.zeros(0)), 0)
-    assert launches == [1], "nothing is launched for nothing"
-
-
-@needs_triton
-def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
-    """The interpreter takes what the compiler does not: types, shapes, control flow."""
-    from triton_compiling import all_launches, spills
-
-    launches = all_launches(monkeypatch.setattr)
-    assert {"march_kernel", "show_kernel", "gather_kernel", "variation_kernel"} < {x.name for x in launches}
-    for launch in launches:
-        assert not spills(launch.compiled(90)), (launch.name, launch.constants)
-
-
-@needs_triton
-@pytest.mark.commands
-@pytest.mark.parametrize("architecture", [75, 80, 86, 89])
-def test_kernels_compile_for_older_gpus(monkeypatch, architecture):
-    from triton_compiling import all_launches, largest_launches
-
-    for launch in largest_launches(all_launches(monkeypatch.setattr)).values():
-        assert launch.compiled(architecture).asm["cubin"], launch.name
+    launches = largest_launches(all_launches(monkeypatch.setattr))
+    assert {"march_kernel", "show_kernel", "gather_kernel", "variation_kernel"} < set(launches)
+    for name, launch in launches.items():
+        compiled = launch.compiled(architecture)
+        assert compiled.asm["cubin"] and (architecture < 90 or not spills(compiled)), (name, launch.constants)
 
 
 @pytest.mark.gpu
@@ -81,15 +46,6 @@ def test_kernels_on_a_gpu():
 
     found = run_checks("cuda", rehearse=False)
     assert found["failed"] == 0 and len(found["checks"]) > 30, [c for c in found["checks"] if not c["ok"]]
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@TRAININGS
-def test_a_step_on_a_gpu_waits_for_it_twice_at_most(scene, plan_file, tmp_path, training, phases):
-    found = waits_of_phases(scene, plan_file, tmp_path, training, "cuda", counted_on_a_gpu)
-    told = {phase: dict(waits.found) for phase, waits in found.items()}
-    assert list(found) == phases and all(1 <= sum(places.values()) <= 2 for places in told.values()), told
 
 
 def test_importing_the_package_imports_no_kernel():

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -30,19 +27,6 @@ def taken(parts, seed=0):
 @pytest.mark.parametrize("parts", [1, 2, 3, 8])
 def test_every_part_is_done_once_and_before_the_call_ends(parts):
     assert all(taken(parts, seed) for seed in range(200))
-
-
-def test_every_part_has_a_number_of_its_own():
-    words, counts = torch.full((6,), 3), torch.full((3,), -1)
-    for _ in range(200):
-        build.call_in_parts("mmpi_count_rows", [0, 1, 3, 6], words, counts.fill_(-1))
-        assert counts.tolist() == [2, 4, 6]
-
-
-def test_several_callers_at_once_each_get_their_own():
-    """A viewer renders while a run trains."""
-    with ThreadPoolExecutor(4) as pool:
-        assert all(pool.map(lambda seed: taken(1 + seed % 4, seed), range(400)))
 
 
 ROWS = 20_000
@@ -89,21 +73,6 @@ def test_what_is_left_to_other_threads_is_done_once_and_before_finish_returns(th
             assert same(steps[i][3:5], stepped(first + i))
 
 
-def test_nothing_is_left_without_other_threads_or_for_few_numbers(three_threads):
-    step = adam_step(0)
-    assert leave(step, ROWS) is None
-    torch.set_num_threads(1)
-    assert leave(step) is None
-    assert same(step[3:5], adam_step(0)[3:5])
-
-
-def test_what_is_dropped_is_finished_first(three_threads):
-    """Its arrays go with it."""
-    step, done = adam_step(0, LONG), stepped(0, LONG)
-    leave(step)
-    assert same(step[3:5], done)
-
-
 def test_a_process_that_is_forked_waits_for_no_thread(monkeypatch):
     """Nor leaves it anything to do."""
     monkeypatch.setattr(build, "num_threads", lambda: 3)
@@ -118,27 +87,3 @@ def test_a_process_that_is_forked_waits_for_no_thread(monkeypatch):
         os._exit(0 if same(step[3:5], stepped(1)) else 1)
     assert os.waitpid(child, 0)[1] == 0
     pending.finish()
-
-
-def test_a_process_ends_well_with_work_left_to_other_threads():
-    script = """
-import torch
-from mmpi_ns.ops import build
-torch.set_num_threads(3)
-rows, moments = torch.arange(64, 2_000_000), torch.zeros(2_000_000, 2, 8, dtype=torch.bfloat16)
-step = rows, 8, torch.ones(len(rows), 8), torch.zeros(2_000_000, 8), moments, 0.9, 0.99, 1.0, 1e-8, 0.1
-kept = build.leave_in_parts("mmpi_adam_rows", len(rows), 1000, *step)
-assert kept is not None
-"""
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
-    assert (ended.returncode, ended.stderr) == (0, "")
-
-
-def test_a_process_that_is_forked_has_no_threads_and_works_alone():
-    assert taken(3)
-    torch.set_num_threads(1)  # those of OpenMP are not there after a fork either, and torch would wait for them
-    child = os.fork()
-    if child == 0:
-        signal.alarm(60)
-        os._exit(0 if taken(3) else 1)
-    assert os.waitpid(child, 0)[1] == 0

@@ -14,7 +14,6 @@ from random_fields import bundle, random_field, random_rays, sampled
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.shade import Layers, SampleNetworks, shade
 
 
 def shaded(channels=9, width=32, octaves=(2, 2)):
@@ -55,18 +54,6 @@ def test_colours_are_those_of_the_networks(channels, width, octaves):
         assert (found.double() - wanted).abs().max() < 2e-5 and (found[~valid] == 0).all()
 
 
-def test_colours_do_not_depend_on_the_number_of_threads():
-    field, samples = shaded()
-    threads, found = torch.get_num_threads(), []
-    for count in (1, 3):
-        try:
-            torch.set_num_threads(count)
-            found.append(colors(field, samples))
-        finally:
-            torch.set_num_threads(threads)
-    assert torch.equal(*found)
-
-
 def test_colours_say_where_a_feature_is_not_a_number():
     field, samples = shaded()
     before = colors(field, samples).isnan().any(-1)
@@ -74,30 +61,3 @@ def test_colours_say_where_a_feature_is_not_a_number():
     field.features.data[read.rows[read.taps[0].positions[3, 0]], 5] = math.nan
     found = colors(field, samples).isnan().any(-1)
     assert not before.any() and found.reshape(-1)[read.index[3]] and not found.all()
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda given: given | {"table": given["table"][:-1]},
-        lambda given: given | {"axes": given["axes"][:4]},
-        lambda given: given | {"directions": given["directions"][:-1]},
-        lambda given: given | {"places": given["places"]._replace(ndc=given["places"].ndc[..., :2])},
-        lambda given: given | {"networks": given["networks"]._replace(position_frequencies=3)},
-        lambda given: given | {"networks": given["networks"]._replace(layers=given["networks"].layers[1:])},
-    ],
-)
-def test_arrays_of_a_wrong_shape_are_refused(change):
-    field, samples = shaded()
-    layers = tuple(Layers(*(x.detach() for x in field.networks.layers(k))) for k in range(5))
-    given = {
-        "layout": field.layout,
-        "table": field.features.data,
-        "networks": SampleNetworks(layers, 2, 2),
-        "axes": torch.eye(3).expand(5, 3, 3),
-        "directions": samples[0].directions,
-        "places": samples[1].places,
-    }
-    shade(**given)
-    with pytest.raises(ValueError, match="where"):
-        shade(**change(given))

@@ -65,28 +65,6 @@ def test_hard_rays_through_thin_and_opaque_planes(raw):
         assert (wanted.mass > 0.5).any() == (raw >= 0)
 
 
-def test_scenes_of_all_sizes_show_the_same():
-    """A scene as large as a city, and one as small as a coin."""
-    for size in (1e5, 1e-4):
-        mpis = (make_mpi(near=size, planes=40), make_mpi("other", (0.1 * size, 0, -0.3 * size), near=size, planes=33))
-        field = random_field(2, seed=3, planes=40)
-        field = MMPIField(ScenePlan(mpis, None, 0.05 * size, size), feature_channels=5, hidden_width=6).eval()
-        field.features.data.normal_(generator=torch.Generator().manual_seed(2))
-        field.density.data.normal_(generator=torch.Generator().manual_seed(3))
-        origins, directions = random_rays(field.plan, 100, seed=4)
-        wanted = compare(field, bundle(origins * size, directions, near=0.05 * size), 1e-3, error=3e-4)
-        assert (wanted.mass > 0.5).any()
-
-
-def test_some_heads_alone_answer():
-    field = random_field(4, True, seed=2, planes=20)
-    rays = bundle(*random_rays(field.plan, 100, seed=1))
-    for head in range(5):
-        mask = (torch.arange(5) == head).expand(100, -1)
-        wanted = compare(field, rays, 1e-3, head_mask=mask)
-        assert (wanted.winner[wanted.mass > 0] == head).all() and (wanted.mass > 0).any()
-
-
 def test_rays_do_not_see_their_neighbours():
     """Whatever their number, their order and the threads, each shows what it shows alone, to the bit."""
     field = random_field(3, True, seed=5, planes=40)
@@ -113,16 +91,6 @@ def test_behind_an_opaque_plane_nothing_is_read_and_a_hundred_thousandth_is_lost
     found = shown(field, bundle([[0, 0, 0]], [[0, 0, 1]]), 1e-3)
     assert found.accumulation.item() == pytest.approx(1, abs=1e-5) and found.gathered.isfinite().all()
     assert 0 < found.dropped_mass.item() <= 1e-5
-
-
-def test_a_texel_that_is_no_number_shows_in_its_rays_alone():
-    field = random_field(2, seed=3, planes=12)
-    rays = bundle(*random_rays(field.plan, 64, seed=1))
-    plain = shown(field, rays)
-    field.features.data[field.grids[0].rows[100]] = math.nan
-    found = shown(field, rays).gathered.isnan().any(1)
-    assert found.any() and not found.all()
-    assert torch.equal(shown(field, rays).gathered[~found], plain.gathered[~found])
 
 
 def test_after_growth_and_release_rays_pass_other_tiles():

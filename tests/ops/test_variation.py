@@ -11,7 +11,7 @@ from compiled import compiled, normal  # noqa: F401
 from hand_made import make_mpi
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.variation import PART, total_variation
+from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK
 
@@ -35,17 +35,6 @@ def test_variation_equals_the_reference_with_its_gradient(channels, chroma):
     assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
 
 
-def test_variation_of_no_texels_is_zero():
-    layout = layout_of([(3, 7, 6)])
-    table, rows, scales = (
-        normal(len(layout.grids[0].places) * BRICK, 8),
-        torch.zeros(0, dtype=torch.int64),
-        torch.ones(1, 3),
-    )
-    for function in (total_variation, total_variation.reference):
-        assert function(table[rows], table, rows, layout, scales) == 0
-
-
 @pytest.mark.parametrize("function", [total_variation, total_variation.reference])
 @pytest.mark.parametrize("channels", [3, 8, 20])
 def test_differences_of_chroma_count_more_in_the_gradient_and_not_in_the_value(function, channels):
@@ -64,39 +53,6 @@ def test_differences_of_chroma_count_more_in_the_gradient_and_not_in_the_value(f
     assert value.item() == pytest.approx(wanted.item(), rel=1e-6)
     assert torch.allclose(fast.grad.double(), torch.tensor(gradient, dtype=torch.float64), rtol=1e-5, atol=2e-4)
     assert (fast.grad - exact.grad).abs().max() > 50
-
-
-@pytest.mark.parametrize(("channels", "chroma"), [(1, 0.0), (8, 0.0), (9, 0.0), (8, 5.0)])
-def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(channels, chroma):
-    layout = layout_of([(3, 70, 60), (2, 50, 41)])
-    grids = layout.grids
-    table = normal(len(grids[0].places) * BRICK, channels) * 2
-    rows = torch.cat([g.rows for g in grids]).sort()[0]
-    assert len(rows) > 3 * PART
-    found, threads, scales = [], torch.get_num_threads(), torch.tensor([(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
-    for count in (1, 3):
-        values = table[rows].requires_grad_()
-        try:
-            torch.set_num_threads(count)
-            value = total_variation(values, table, rows, layout, scales, chroma)
-            value.backward()
-        finally:
-            torch.set_num_threads(threads)
-        found.append((value, values.grad))
-    assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
-    values = table[rows].double().requires_grad_()
-    wanted = total_variation.reference(values, table.double(), rows, layout, scales, chroma)
-    wanted.backward()
-    assert found[0][0].item() == pytest.approx(wanted.item(), rel=1e-6)
-    assert torch.allclose(found[0][1].double(), values.grad, atol=2e-6 * (1 + chroma))
-
-
-@pytest.mark.parametrize(("rows", "values", "heads", "more"), [(9, 8, 1, 0), (9, 9, 2, 0), (9, 9, 1, 64)])
-def test_arrays_of_a_wrong_shape_are_refused(rows, values, heads, more):
-    layout = layout_of([(2, 9, 9)])
-    table = normal(len(layout.grids[0].places) * BRICK + more, 3)
-    with pytest.raises(ValueError, match="where"):
-        total_variation(normal(values, 3), table, torch.arange(rows), layout, torch.ones(heads, 3))
 
 
 def test_variation_says_where_a_texel_is_not_a_number():

@@ -51,24 +51,6 @@ def test_border_points_surround_what_a_camera_sees(scene):
         assert np.allclose(np.unique(depth.round(6)), visible.typical[i], rtol=1e-5)
 
 
-def test_texels_keep_their_size_and_nothing_else_changes(scene):
-    observations, visible = scene
-    whole = place(observations, PlacementConfig()).mpis[0]
-    u0, u1, v0, v1 = whole.extent
-    small = replace(whole, extent=(u0 / 2, u1 / 2, v0 / 2, v1 / 2), width=whole.width // 2, height=whole.height // 2)
-    (got,) = widened([small], observations, visible)
-    assert got.extent[0] < small.extent[0] and got.extent[3] > small.extent[3]
-    pitch = [(m.extent[1] - m.extent[0]) / (m.width - 1) for m in (small, got)]
-    assert pitch[1] == pytest.approx(pitch[0], rel=0.02)
-    assert replace(got, extent=small.extent, width=small.width, height=small.height) == small
-
-
-def test_an_mpi_that_holds_everything_stays_as_it_is(scene):
-    observations, visible = scene
-    (mpi,) = place(observations, PlacementConfig()).mpis
-    assert widened([mpi], observations, visible) == [mpi]
-
-
 def test_what_would_need_too_wide_a_frustum_is_left_out(scene):
     observations, visible = scene
     (mpi,) = place(observations, PlacementConfig()).mpis

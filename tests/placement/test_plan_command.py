@@ -9,14 +9,10 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
-from procedural import observations_of
 
-from mmpi_ns.config import mmpi, mmpi_small
-from mmpi_ns.placement.observations import find_visible_points
-from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.show import describe_facing, explain, table
+from mmpi_ns.config import mmpi_small
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.scripts.plan import PlanCommand, entrypoint
+from mmpi_ns.scripts.plan import entrypoint
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
 
@@ -62,35 +58,10 @@ def test_an_edited_plan_is_explained_and_kept(scene, tmp_path, monkeypatch, caps
     )
 
 
-def test_the_defaults_are_those_of_training(tmp_path, monkeypatch):
-    commands = []
-    monkeypatch.setattr(PlanCommand, "main", lambda command: commands.append(command))
-    assert not run(monkeypatch, "scene", "--output", tmp_path)
-    assert commands[-1].placement == mmpi.config.pipeline.model.placement
-
-
 def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, tmp_path / "nowhere", "--output", tmp_path / "plan") == 1
     assert "There is no scene at" in capsys.readouterr().err
     assert not (tmp_path / "plan").exists()
-
-
-def test_the_table_adds_up():
-    observations = observations_of(make_scene("object"), per_camera=25)
-    plan = place(observations, PlacementConfig(arrangement="room", cube_voxels=32))
-    report = explain(plan, observations, find_visible_points(observations))
-    assert plan.cube is not None and len(report.shares) == len(plan.mpis) + 1
-    assert report.shares.sum() + report.unserved == pytest.approx(1)
-    assert (report.error_without >= report.error_with).all() and 1 <= report.overlap <= plan.num_heads
-    assert len(table(plan, observations, report).splitlines()) == plan.num_heads + 4
-
-
-def test_facings_are_named_in_the_cameras_frame():
-    base = np.eye(3)  # right, down, forward
-    named = {(0, 0, 1): "front", (1, 0, 0): "right", (-1, 0, 0): "left", (0, 1, 0): "below", (0, 0, -1): "back"}
-    for direction, name in named.items():
-        assert describe_facing(np.array(direction, float), base) == name
-    assert describe_facing(np.array([0.5, 0, 0.8660254]), base) == "front, 30 deg off"
 
 
 def test_a_long_capture_is_planned_window_by_window_and_its_plan_goes_back_in(tmp_path, monkeypatch, capsys):

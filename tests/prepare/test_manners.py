@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import shlex
 import signal
 import subprocess
@@ -12,13 +10,11 @@ import time
 
 import corridor
 import numpy as np
-import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.utils.errors import InputError, progress
+from mmpi_ns.utils.errors import InputError
 from mmpi_prepare import images
-from mmpi_prepare.checks import Finding, by_kind
 from mmpi_prepare.pipeline import WORK, only_one, prepare
 from mmpi_prepare.settings import Settings
 from mmpi_priors.sfm import quiet
@@ -55,29 +51,6 @@ def test_copies_of_no_pixel_are_refused_before_any_work(frames, tmp_path):
     assert not (tmp_path / "scene/transforms.json").exists()
 
 
-def test_files_that_options_name_are_read_before_any_work(frames, tmp_path):
-    scene, lists = tmp_path / "scene", tmp_path / "lists.json"
-    for text, words in (("{", "cannot be read"), ('{"train_filenames": []}', "test_filenames")):
-        lists.write_text(text)
-        with pytest.raises(InputError, match=words):
-            prepare(Settings(frames, scene, split_from=lists))
-    for options in ({"poses": tmp_path / "none.txt"}, {"masks": tmp_path / "none"}, {"split_from": tmp_path / "no"}):
-        with pytest.raises(InputError, match=r"none|no"):
-            prepare(Settings(frames, scene, **options))
-    assert not scene.exists()
-    lists.write_text('{"train_filenames": ["frame_001.png"], "test_filenames": ["frame_999.png"]}')
-    with pytest.raises(InputError, match="None of the 1 test_filenames"):
-        prepare(Settings(frames, scene, split_from=lists))
-    assert not (scene / WORK / "features").exists()
-
-
-def test_an_old_pycolmap_is_named_with_the_remedy(frames, tmp_path, monkeypatch):
-    monkeypatch.setattr(pycolmap, "__version__", "3.13.0")
-    with pytest.raises(InputError, match=r"pycolmap 3\.13\.0 is installed.*pip install 'pycolmap>=4'"):
-        prepare(Settings(frames, tmp_path / "scene"))
-    assert not (tmp_path / "scene").exists()
-
-
 def test_a_second_run_into_a_scene_says_so_and_ends(frames, tmp_path):
     with only_one(tmp_path / "scene" / WORK), pytest.raises(InputError, match=r"Another mmpi-prepare is making"):
         prepare(Settings(frames, tmp_path / "scene"))
@@ -90,15 +63,6 @@ def test_a_scene_that_cannot_be_written_is_one_sentence(tmp_path):
     with pytest.raises(InputError, match=r"notes.txt.* cannot be read or written \(Not a directory\): check the path"):
         with only_one(tmp_path / "notes.txt" / "scene" / WORK):
             pass
-
-
-def test_a_full_disk_is_called_a_full_disk(frames, tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(images.shutil, "copyfile", full)
-    with pytest.raises(InputError, match=r"disk of .*scene is full"):
-        prepare(Settings(frames, tmp_path / "scene"))
 
 
 def test_what_is_not_read_is_counted_and_named(frames, capsys, monkeypatch):
@@ -129,23 +93,6 @@ def test_a_photo_of_a_telephone_is_read(tmp_path):
     assert np.abs(copy - np.asarray(picture, float)).mean() < 4
 
 
-def test_a_bar_counts_no_more_than_there_are():
-    with progress("Mapping", 10) as advance:
-        bar = advance.__closure__
-        tasks = next(c.cell_contents for c in bar if hasattr(c.cell_contents, "tasks")).tasks
-        advance(2, 0)
-        for _ in range(20):
-            advance(1)
-        assert tasks[0].completed == 10
-        advance(2, 0)  # another initial pair
-        assert tasks[0].completed == 2
-
-
-def test_findings_of_a_kind_share_a_line_worst_first():
-    found = [Finding("moving?", f"f{i}", f"{i} %", i) for i in (3, 9, 5)] + [Finding("bent?", "", "2 px")]
-    assert by_kind(found) == ["moving? f9: 9 %; then f5, f3", "bent? 2 px"]
-
-
 def test_the_last_line_is_a_command_to_copy(tmp_path, capsys):
     corridor.write_images(tmp_path / "frames", 8)
     scene = tmp_path / ("a [long] name " * 9).strip()
@@ -168,19 +115,6 @@ def test_a_signal_ends_it_with_one_sentence(number, tmp_path):
     assert said.replace("\x1b[?25h", "").strip() == "mmpi-prepare: interrupted; the same command continues from here."
     prepare(Settings(tmp_path / "frames", tmp_path / "scene", threads=1))
     assert (tmp_path / "scene" / "transforms.json").is_file()
-
-
-def test_a_signal_ends_the_command_while_the_interpreters_lock_is_held(tmp_path):
-    """As COLMAP's bundle adjustment holds it."""
-    program = (
-        "from mmpi_prepare.__main__ import end_at_once_on_signals; import ctypes; end_at_once_on_signals();"
-        "print('at work', flush=True); ctypes.PyDLL(None).sleep(60)"
-    )
-    run = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert run.stdout is not None and run.stdout.readline() == "at work\n"
-    run.send_signal(signal.SIGTERM)
-    _, said = run.communicate(timeout=30)
-    assert run.returncode == 128 + signal.SIGTERM and "interrupted" in said
 
 
 @pytest.mark.parametrize(

@@ -10,16 +10,13 @@ import corridor
 import numpy as np
 import pycolmap
 import pytest
-from PIL import Image
 
 from mmpi_ns.utils.errors import InputError
-from mmpi_prepare import adjustment, features, mapping
-from mmpi_prepare.adjustment import camera_poses, similarity_between, with_all_points, with_fewer_points
-from mmpi_prepare.images import Photo
+from mmpi_prepare import adjustment, mapping
+from mmpi_prepare.adjustment import camera_poses, similarity_between, with_all_points
 from mmpi_prepare.mapping import Task, map_and_judge
 from mmpi_prepare.pipeline import WORK, prepare
 from mmpi_prepare.settings import Settings
-from mmpi_priors.sfm import count_features
 
 COUNT = 12
 
@@ -47,13 +44,6 @@ def error_of(model):
     moved = similarity_between(poses, given)
     off = [np.linalg.norm(moved * p - q) for p, q in zip(poses[:, :3, 3], given[:, :3, 3], strict=True)]
     return max(off) / np.linalg.norm(np.diff(given[:, :3, 3], axis=0), axis=-1).sum()
-
-
-@pytest.mark.parametrize(("count", "step"), [(64, 1), (199, 1), (200, 2), (300, 3), (1000, 10)])
-def test_of_a_long_sequence_a_hundred_images_are_placed_first(task, count, step):
-    names = [f"{i:04d}.jpg" for i in range(count)]
-    assert replace(task, offered=names).placed == names[::step]
-    assert replace(task, offered=names, is_ordered=False).placed == names
 
 
 def test_a_candidate_whose_lens_ends_within_its_images_is_judged(task):
@@ -140,47 +130,6 @@ def test_a_placed_model_is_given_the_points_of_all_matches_and_adjusted(task):
     assert camera.mean_focal_length() == pytest.approx(given.mean_focal_length(), rel=0.01)
     assert max(p.error for p in found.points3D.values()) <= adjustment.LARGEST_ERROR
     assert error_of(found) < 0.01
-
-
-def test_fewer_points_are_those_that_most_images_see_and_every_image_keeps_enough(task, monkeypatch):
-    monkeypatch.setattr(adjustment, "ENOUGH_POINTS", 40)
-    model = pycolmap.Reconstruction(task.database.parents[1] / "model/model")
-    before = model.num_points3D()
-    light = with_fewer_points(model)
-    assert model.num_points3D() == before > 2 * light.num_points3D()
-    for number, image in light.images.items():
-        assert image.num_points3D >= min(40, model.images[number].num_points3D)
-    lengths = {i: p.track.length() for i, p in model.points3D.items()}
-    for number in set(model.points3D) - set(light.points3D):  # each image that sees it has enough as long ones
-        for seen in model.points3D[number].track.elements:
-            kept = [p.point3D_id for p in light.images[seen.image_id].points2D if p.has_point3D()]
-            assert sum(lengths[i] >= lengths[number] for i in kept) >= 40
-
-
-@pytest.mark.parametrize("is_poor", [True, False])
-def test_weak_features_count_where_images_have_few(tmp_path, monkeypatch, is_poor):
-    """Large images of noise have enough; ones of faint blobs do not."""
-    random, size = np.random.default_rng(0), (480, 640)
-    (tmp_path / "images").mkdir()
-    for i in range(3):
-        coarse = random.normal(128, 4 if is_poor else 60, (24, 32) if is_poor else (160, 213))
-        image = Image.fromarray(coarse.clip(0, 255).astype(np.uint8)).resize(size[::-1], Image.Resampling.BICUBIC)
-        image.convert("RGB").save(tmp_path / f"images/{i}.png")
-    asked: list[tuple[int, float]] = []
-    real = pycolmap.extract_features
-
-    def watch(*args, image_names, extraction_options, **rest):
-        assert extraction_options.max_image_size == features.LARGEST_SIDE
-        asked.append((len(image_names), extraction_options.sift.peak_threshold))
-        return real(*args, image_names=image_names, extraction_options=extraction_options, **rest)
-
-    monkeypatch.setattr(pycolmap, "extract_features", watch)
-    photos = [Photo(f"{i}.png", 640, 480) for i in range(3)]
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[600, 320, 240, 0], camera_id=1)
-    features.extract(tmp_path / "images", photos, ([1] * 3, [camera]), None, 8192, 1, tmp_path)
-    usual = pycolmap.FeatureExtractionOptions().sift.peak_threshold
-    assert asked[-1] == (3, pytest.approx(features.FAINT if is_poor else usual))
-    assert min(count_features(tmp_path / "database.db")) > 50 and not (tmp_path / "sample.db").exists()
 
 
 def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task, monkeypatch):

@@ -82,30 +82,12 @@ def test_nerfstudio_reads_the_scene_and_its_tracks_in_one_frame(scene):
     assert error < 0.3
 
 
-def test_points_file_holds_the_models_points(scene):
-    model = pycolmap.Reconstruction(scene / "colmap/sparse/0")
-    data = (scene / "sparse_pc.ply").read_bytes()
-    header, body = data.split(b"end_header\n", 1)
-    assert f"element vertex {model.num_points3D()}".encode() in header
-    layout = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    table = np.frombuffer(body, layout)
-    colors = {tuple(np.float32(p.xyz)): tuple(p.color) for p in model.points3D.values()}
-    assert {tuple(row["xyz"]): tuple(row["rgb"]) for row in table} == colors
-
-
 def test_split_is_stated_and_covers_all_images(scene):
     content = read_json(scene)
     train, test = set(content["train_filenames"]), set(content["test_filenames"])
     assert not train & test and len(train | test) == COUNT
     assert content["applied_transform"] == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
     assert "one image in 8 tests" in (scene / "report.md").read_text()
-
-
-def test_downscaled_copies_are_box_averages(scene):
-    whole = np.asarray(Image.open(scene / "images/frame_003.png")).astype(float)
-    small = np.asarray(Image.open(scene / "images_4/frame_003.png")).astype(float)
-    assert small.shape == (corridor.HEIGHT // 4, corridor.WIDTH // 4, 3)
-    assert small[2, 5] == pytest.approx(whole[8:12, 20:24].mean((0, 1)), abs=0.6)
 
 
 def test_masks_are_carried_along_and_keep_features_away(scene):
@@ -189,38 +171,3 @@ def test_undistorted_scene_has_no_lens_and_straight_images(capture, tmp_path):
 def test_ordered_poses_come_back_in_the_order_of_the_images(scene):
     names, _ = camera_poses(pycolmap.Reconstruction(scene / "colmap/sparse/0"))
     assert names == [f"frame_{i + 1:03d}.png" for i in range(COUNT)]
-
-
-def test_interrupted_mapping_goes_on_from_its_snapshot(capture, tmp_path, monkeypatch):
-    settings = Settings(capture / "frames", tmp_path / "scene", threads=1)
-    registered = []
-
-    run = pycolmap.incremental_mapping
-
-    def count_to(most):
-        def mapping_that_counts(*args, initial_image_pair_callback, next_image_callback, **options):
-            def count(images, callback):
-                callback()
-                registered.append(images)
-                if sum(registered) > most:
-                    raise KeyboardInterrupt
-
-            return run(
-                *args,
-                initial_image_pair_callback=lambda: count(2, initial_image_pair_callback),
-                next_image_callback=lambda: count(1, next_image_callback),
-                **options,
-            )
-
-        return mapping_that_counts
-
-    monkeypatch.setattr(mapping, "SNAPSHOT", 3)
-    monkeypatch.setattr(pycolmap, "incremental_mapping", count_to(8))
-    with pytest.raises(KeyboardInterrupt):
-        prepare(settings)
-    registered.clear()
-    monkeypatch.setattr(pycolmap, "incremental_mapping", count_to(1000))
-    prepare(settings)
-    assert 0 < sum(registered) < COUNT  # the others came with the snapshot
-    assert len(read_json(tmp_path / "scene")["frames"]) == COUNT
-    assert error_after_alignment(tmp_path / "scene", corridor.poses(COUNT)) < 0.01

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import corridor
 import cv2
 import numpy as np
@@ -18,16 +16,14 @@ from mmpi_prepare import checks, export, features
 from mmpi_prepare.checks import exposure_in_words
 from mmpi_prepare.images import (
     Photo,
-    choose_frames,
     find_images,
     gather,
-    gather_masks,
     measure,
     select_frames,
     sharpness,
 )
 from mmpi_prepare.pipeline import prepare
-from mmpi_prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
+from mmpi_prepare.poses import make_cameras
 from mmpi_prepare.settings import Settings
 
 
@@ -89,24 +85,6 @@ def test_every_written_image_keeps_its_exposure(suffix, turned, tmp_path):
         assert exposure_in_words(files) == "varies 1.0-fold by the EXIF of 2 images"
 
 
-def test_exif_that_says_nothing_gives_no_exposure(tmp_path):
-    assert np.isnan(light_of(save(tmp_path / "bare.jpg")))
-    for n, time in enumerate((IFDRational(0, 1), IFDRational(0, 0))):
-        exif = Image.Exif()
-        exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExposureTime: time, ExifTags.Base.FNumber: IFDRational(2, 1)}
-        assert np.isnan(light_of(save(tmp_path / f"{n}.jpg", exif=exif)))
-    exif = Image.Exif()
-    exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExposureTime: IFDRational(1, 8)}
-    assert light_of(save(tmp_path / "time.jpg", exif=exif)) == 12.5
-    assert exposure_in_words([tmp_path / "bare.jpg"]) == "not known: no EXIF"
-
-
-def test_names_in_no_utf_8_are_replaced(tmp_path):
-    """COLMAP refuses them."""
-    files = [save(tmp_path / "in" / os.fsdecode(name)) for name in (b"caf\xe9 1.png", b"caf\xe8 1.png")]
-    assert [p.name for p in gather(tmp_path / "in", files, tmp_path / "work")] == ["caf_1.png", "caf_1_.png"]
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
 def test_damaged_exif_counts_as_none(suffix, tmp_path):
     file = save(tmp_path / f"in/a{suffix}", exif=b"Exif\0\0no tags at all")
@@ -157,32 +135,6 @@ def test_plain_photo_is_copied_byte_for_byte(tmp_path):
     assert (tmp_path / "out/images/1.jpg").read_bytes() == files[1].read_bytes()
 
 
-def test_image_without_mask_gets_a_white_one(tmp_path):
-    photos = [Photo("a.jpg", 4, 3, source="a.jpg"), Photo("b.jpg", 4, 3, source="b.jpg")]
-    save(tmp_path / "masks/a.jpg.png", (4, 3), 0)
-    assert gather_masks(tmp_path / "masks", photos, tmp_path / "out") == 1
-    assert np.asarray(Image.open(tmp_path / "out/a.jpg.png")).max() == 0
-    assert np.asarray(Image.open(tmp_path / "out/b.jpg.png")).min() == 255
-
-
-def test_masks_of_two_folders_go_to_the_images_of_theirs(tmp_path):
-    for side, value in (("left", 0), ("right", 255)):
-        save(tmp_path / f"masks/{side}/1.png", (4, 3), value)
-    sources = [f"{side}/1.jpg" for side in ("left", "right", "back")]
-    photos = [Photo(s.replace("/", "-"), 4, 3, source=s) for s in sources]
-    assert gather_masks(tmp_path / "masks", photos, tmp_path / "out") == 2  # whose "back" is, nobody can tell
-    found = [np.asarray(Image.open(tmp_path / f"out/{p.name}.png")) for p in photos]
-    assert [(f.min(), f.max()) for f in found] == [(0, 0), (255, 255), (255, 255)]
-    save(tmp_path / "one/elsewhere/1.png", (4, 3), 0)
-    assert gather_masks(tmp_path / "one", photos, tmp_path / "out") == 3
-
-
-def test_mask_of_another_size_is_refused(tmp_path):
-    save(tmp_path / "masks/a.png", (5, 3), 0)
-    with pytest.raises(InputError, match="5x3"):
-        gather_masks(tmp_path / "masks", [Photo("a.jpg", 4, 3, source="a.jpg")], tmp_path / "out")
-
-
 def test_masked_pixels_stay_masked_when_downscaled(tmp_path):
     mask = np.full((4, 4), 255, np.uint8)
     mask[1, 1] = 0
@@ -191,29 +143,12 @@ def test_masked_pixels_stay_masked_when_downscaled(tmp_path):
     assert np.asarray(Image.open(tmp_path / "small.png")).tolist() == [[0, 255], [255, 255]]
 
 
-def test_images_of_one_lens_share_a_camera():
-    photos = [Photo("a", 4, 3, "x"), Photo("b", 4, 3, "x"), Photo("c", 4, 3, "y"), Photo("d", 8, 6, "x")]
-    for sharing, numbers in (("auto", [1, 1, 2, 3]), ("per-image", [1, 2, 3, 4])):
-        assert make_cameras(photos, sharing, {}, None, "auto")[0] == numbers
-    with pytest.raises(InputError, match="different sizes"):
-        make_cameras(photos, "shared", {}, None, "auto")
-
-
 def test_focal_length_comes_from_the_option_then_exif_then_a_guess():
     photos = [Photo("a", 100, 50, exif_focal=77.0)]
     bare = [Photo("a", 100, 50)]
     for images, focal, expected in ((photos, 60.0, 60), (photos, None, 77), (bare, None, 120)):
         (camera,) = make_cameras(images, "auto", {}, focal, "auto")[1]
         assert camera.mean_focal_length() == expected
-
-
-def test_given_camera_comes_back_from_colmaps(tmp_path):
-    given = opencv_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
-    (camera,) = make_cameras([Photo("a", 100, 50)], "auto", {"a": given}, None, "auto")[1]
-    assert opencv_intrinsics(camera) == ([90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004], False)
-    for numbers, says in (((1.0, 2.0), "--camera takes"), ((-1.0, 2.0, 3.0), "must be positive")):
-        with pytest.raises(InputError, match=says):
-            prepare(Settings(tmp_path, tmp_path / "scene", camera=numbers))
 
 
 def chain(count, loop=None):
@@ -298,11 +233,6 @@ def test_frames_are_chosen_by_motion_and_sharpness(drive, tmp_path):
     assert size == (corridor.WIDTH, corridor.HEIGHT) == (photos[0].width, photos[0].height)
 
 
-def test_no_more_frames_than_asked():
-    chosen, used = choose_frames(np.full(500, 0.05), np.ones(500), 40, 0.01)
-    assert len(chosen) <= 40 and used > 0.5 and chosen == sorted(set(chosen))
-
-
 def test_broken_video_is_named(tmp_path, drive):
     (tmp_path / "no.mp4").write_bytes(b"not a video at all" * 100)
     with pytest.raises(InputError, match=r"no\.mp4"):
@@ -321,39 +251,11 @@ def test_too_few_images_are_refused(count, words, tmp_path):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
 
 
-def test_two_images_without_poses_are_refused_before_any_work(tmp_path):
-    corridor.write_images(tmp_path / "in", 2)
-    with pytest.raises(InputError, match="for 2 images alone, as no third confirms them"):
-        prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
-    assert not (tmp_path / "scene/.prepare/features").exists()
-
-
 def test_truncated_image_is_named(tmp_path):
     save(tmp_path / "in/a.png")
     (tmp_path / "in/b.jpg").write_bytes(save(tmp_path / "whole.jpg", (90, 90)).read_bytes()[:300])
     with pytest.raises(InputError, match=r"b\.jpg cannot be read"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
-
-
-def test_a_link_to_nowhere_among_the_images_is_named(tmp_path):
-    corridor.write_images(tmp_path / "in", 2)
-    (tmp_path / "in/lost.png").symlink_to(tmp_path / "no.png")
-    with pytest.raises(InputError, match=r"in/lost\.png cannot be read"):
-        prepare(Settings(tmp_path / "in", tmp_path / "scene"))
-
-
-def test_an_image_that_pillow_takes_for_an_attack_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 30)
-    Image.new("RGB", (9, 9)).save(tmp_path / "huge.png")
-    with pytest.raises(InputError, match=r"huge.png cannot be read \(Image size \(81 pixels\)"):
-        gather(tmp_path, [tmp_path / "huge.png"], tmp_path / "work")
-
-
-def test_blank_images_are_refused(tmp_path):
-    for n in range(3):
-        save(tmp_path / "in" / f"{n}.png")
-    with pytest.raises(InputError, match="Hardly any features"):
-        prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
 
 
 def test_images_without_overlap_are_refused(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import corridor
@@ -10,7 +9,6 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from PIL import Image
 
 from mmpi_ns.utils.errors import InputError
 from mmpi_prepare import export, features, mapping
@@ -25,7 +23,7 @@ from mmpi_prepare.adjustment import (
     turns_back,
     worth,
 )
-from mmpi_prepare.images import Photo, choose_frames, median_motion
+from mmpi_prepare.images import Photo
 from mmpi_prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
 from mmpi_priors.sfm import rigid3d
 
@@ -117,21 +115,6 @@ def test_a_straight_track_is_fitted_without_a_turn_about_itself():
 # Video ---------------------------------------------------------------------------------------------------------------
 
 
-def test_frames_of_equal_sharpness_are_evenly_spaced():
-    motion, sharp = np.full(101, 0.01), np.ones(101)
-    chosen, used = choose_frames(motion, sharp, 300, 0.1)
-    assert used == 0.1 and chosen == [0, 9, 19, 29, 39, 49, 59, 69, 79, 89, 99]  # frame i has moved by (i + 1) / 100
-    sharp[[32, 57]] = 1.1, 3.0  # not worth it so far off the middle of the stretch; worth it
-    assert choose_frames(motion, sharp, 300, 0.1)[0][3:7] == [29, 39, 49, 57]
-
-
-def test_motion_is_a_share_of_the_width():
-    gray = cv2.cvtColor(corridor.picture(corridor.poses(1)[0]), cv2.COLOR_RGB2GRAY)
-    before, after = np.ascontiguousarray(gray[:, :200]), np.ascontiguousarray(gray[:, 8:208])
-    assert median_motion(before, after) == pytest.approx(8 / 200, rel=0.02)
-    assert median_motion(before, np.zeros_like(before)) == pytest.approx(0.15)
-
-
 # Lenses --------------------------------------------------------------------------------------------------------------
 
 SIZE = {"width": 200, "height": 160, "camera_id": 1}
@@ -157,11 +140,6 @@ def test_a_lens_of_colmap_projects_as_opencv_says(model, params):
     args = (still, still, matrix, np.array(terms))
     wanted = (project(rays[None], *args) if is_fisheye else project(rays, *args))[0].reshape(-1, 2)
     assert camera.img_from_cam(rays) == pytest.approx(wanted, abs=1e-6)
-
-
-def test_a_lens_without_a_place_in_transforms_is_named():
-    with pytest.raises(InputError, match="FULL_OPENCV"):
-        opencv_intrinsics(pycolmap.Camera(model="FULL_OPENCV", params=[150, 140, 98, 83, *[0.0] * 8], **SIZE))
 
 
 def test_given_lenses_are_kept_apart_and_come_back_from_colmaps():
@@ -200,38 +178,6 @@ def test_images_of_several_cameras_state_their_own_intrinsics():
         export.transforms(model_of(corridor.poses(2), *mixed), split, False, {}, {})
 
 
-@pytest.mark.parametrize("mask", [False, True])
-def test_what_remains_at_the_far_edges_is_cut_off_when_downscaled(tmp_path, mask):
-    values = np.random.default_rng(0).integers(0, 255, (7, 9), np.uint8)
-    Image.fromarray(values).save(tmp_path / "whole.png")
-    export.downscale(tmp_path / "whole.png", tmp_path / "small.png", 2, mask)
-    blocks = values[:6, :8].reshape(3, 2, 4, 2)
-    wanted = blocks.min((1, 3)) if mask else blocks.mean((1, 3))
-    assert np.abs(np.asarray(Image.open(tmp_path / "small.png")).astype(float) - wanted).max() <= 0.5
-
-
-def test_a_scene_is_whole_whenever_its_transforms_are_there(tmp_path, monkeypatch):
-    """Moving stops after each file in turn: whoever looks meanwhile finds no transforms.json beside half a scene."""
-    moved, rename = [], Path.rename
-
-    def record(path, target):
-        moved.append((path.parent.name, path.name))
-        return rename(path, target)
-
-    for folder in ("built", "scene"):
-        for name in ("images", "images_2", "masks"):
-            (tmp_path / folder / name).mkdir(parents=True)
-        (tmp_path / folder / "transforms.json").write_text(folder)
-    (tmp_path / "scene/mine.txt").touch()
-    monkeypatch.setattr(Path, "rename", record)
-    export.publish(tmp_path / "built", tmp_path / "scene", tmp_path / "scene/previous")
-    assert moved[0] == ("scene", "transforms.json") and moved[-1] == ("built", "transforms.json")
-    assert sorted(moved[1:4]) == [("scene", n) for n in ("images", "images_2", "masks")]
-    assert {p.name for p in (tmp_path / "scene").iterdir()} == {
-        "images", "images_2", "masks", "transforms.json", "mine.txt", "previous",
-    }  # fmt: skip
-
-
 # Mapping -------------------------------------------------------------------------------------------------------------
 
 
@@ -249,31 +195,6 @@ def test_a_sound_model_beats_a_bent_one_with_more_images_and_errors_are_judged_b
     models = [found_model(50, 0.9), found_model(30, 0.7), found_model(31, 0.7), found_model(31, 0.6)]
     ranked = sorted(range(4), key=lambda i: quality(models[i]))
     assert ranked == [0, 1, 2, 3]
-
-
-@pytest.mark.parametrize(
-    ("first", "starts"),
-    [
-        (found_model(60, 0.5), [None, Path("forward")]),  # sound, most images: gone on from
-        (found_model(40, 0.5), [None, None]),  # too few of them
-        (found_model(60, 0.9), [None, None]),  # bent
-        (found_model(96, 0.5), [None]),  # enough
-    ],
-)
-def test_looser_settings_go_on_from_a_sound_model_of_most_images(first, starts, tmp_path, monkeypatch):
-    seen = []
-
-    def run(task, attempt, database, start):
-        seen.append(start)
-        return first if len(seen) == 1 else found_model(99, 0.6), Path(attempt.name)
-
-    monkeypatch.setattr(mapping, "matching_pairs", lambda path: [(1, 2)] * 500)
-    monkeypatch.setattr(mapping, "_run", run)
-    names, free = [f"{i}.jpg" for i in range(100)], (True, False, False)
-    task = mapping.Task(tmp_path / "database", tmp_path, tmp_path, names, *free, 1, is_sequence=True, is_ordered=True)
-    best, _ = mapping.reconstruct(task, task.database)
-    assert seen == starts
-    assert best.num_reg_images() == (96 if len(starts) == 1 else 99)
 
 
 def test_given_intrinsics_are_left_alone_and_others_refined():

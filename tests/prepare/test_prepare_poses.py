@@ -81,13 +81,6 @@ def test_tum_poses_are_matched_by_time_stamp(tmp_path):
     assert read(path, photos=photos)[1] == pytest.approx(GIVEN[[5, 2]], abs=1e-9)
 
 
-def test_lost_poses_are_left_out(tmp_path):
-    lost = GIVEN.copy()
-    lost[3] = -np.inf
-    known, _ = read(write_matrices(tmp_path / "poses", lost))
-    assert sorted(known.poses) == [p.name for i, p in enumerate(PHOTOS) if i != 3]
-
-
 def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_path):
     lists = {"train_filenames": ["images/frame_001.png"], "test_filenames": ["images/frame_002.png"]}
     lens = {"fl_y": 350.0, "cx": 236.0, "cy": 162.0, "k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5}
@@ -101,35 +94,6 @@ def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_pa
     assert known.split is None
     with pytest.raises(InputError, match="says otherwise"):
         read(write_transforms(path, GIVEN, w=400))
-
-
-def test_images_of_one_name_in_two_folders_get_the_poses_of_their_folders_or_none(tmp_path):
-    sources = [f"{side}/{n:03d}.png" for side in ("left", "right") for n in range(2)]
-    photos = [Photo(s.replace("/", "-"), 9, 9, source=s) for s in sources]
-    frames = [
-        {"file_path": f"./capture/{s}", "transform_matrix": (pose @ FLIP).tolist()}
-        for s, pose in zip(sources, GIVEN, strict=False)
-    ]
-    path = tmp_path / "transforms.json"
-    path.write_text(json.dumps({"frames": frames[::-1]}))
-    assert read(path, photos=photos)[1] == pytest.approx(GIVEN[:4], abs=1e-9)
-    path.write_text(json.dumps({"frames": frames[:2]}))
-    with pytest.raises(InputError, match=r"one pose for left-000\.png and right-000\.png"):
-        read(path, photos=photos)
-    folder = tmp_path / "poses"
-    folder.mkdir()
-    for n in range(2):
-        np.savetxt(folder / f"{n:03d}.txt", GIVEN[n])
-    with pytest.raises(InputError, match="one pose for"):
-        read(folder, photos=photos)
-
-
-def test_lines_that_no_number_of_an_image_can_name_are_refused(tmp_path):
-    path = write_kitti(tmp_path / "poses.txt", corridor.poses(30))
-    for last in ("30", "three"):
-        photos = [Photo(f"{n}.png", 9, 9, source=f"{n}.png") for n in ("3", "10", last)]
-        with pytest.raises(InputError, match="30 poses for 3 images: they cannot be matched"):
-            read(path, photos=photos)
 
 
 @pytest.mark.parametrize(

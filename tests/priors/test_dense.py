@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import replace
 
 import cv2
@@ -13,41 +12,11 @@ from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
 from mmpi_priors import dense
-from mmpi_priors.dense import Depth, confirmed, find_depths, without_fringes
+from mmpi_priors.dense import Depth, confirmed, find_depths
 from mmpi_priors.ops.matches import average_matches
-from mmpi_priors.views import View, camera_matrix, load_view, look_up, project
+from mmpi_priors.views import camera_matrix, load_view, project
 
 F32 = np.float32
-
-
-def values_at(image, x, y, nearest):
-    """Oracle of ``look_up`` for a list of places, float64: what is nearest, or interpolated within the borders."""
-    x, y, image = np.float32(x) - 0.5, np.float32(y) - 0.5, image.astype(np.float64)
-    height, width = image.shape[:2]
-    if nearest:
-        c, r = np.rint(x).astype(int), np.rint(y).astype(int)
-        inside = (c >= 0) & (c < width) & (r >= 0) & (r < height)
-        return np.where(inside, image[r.clip(0, height - 1), c.clip(0, width - 1)].T, 0).T
-    x, y = x.clip(0, width - 1), y.clip(0, height - 1)
-    c, r = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
-    u, v = (x - c, y - r) if image.ndim == 2 else ((x - c)[:, None], (y - r)[:, None])
-    upper, lower = ((1 - u) * image[k, c] + u * image[k, c + 1] for k in (r, r + 1))
-    return (1 - v) * upper + v * lower
-
-
-@pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3), (3, 70_000), (50_000, 2, 3), (2, 32_767), (8193, 3)])
-@pytest.mark.parametrize("nearest", [True, False])
-def test_images_and_lists_of_any_size_are_looked_up(shape, nearest):
-    rng = np.random.default_rng(0)
-    image = rng.random(shape).astype(F32)
-    x, y = rng.uniform(-3, shape[1] + 3, 100_000), rng.uniform(-3, shape[0] + 3, 100_000)
-    x[:9], y[:9] = [-1e4, 1e6, -1e6, 0, 0.5, shape[1], shape[1] - 0.5, 8192.5, 8192.2], 1.5
-    expected = values_at(image, x, y, nearest)
-    step = 0 if nearest else 1 / 32  # OpenCV rounds places to this much of a pixel
-    assert np.abs(look_up(image, x, y, nearest=nearest) - expected).max() <= step + 1e-6
-    folded = look_up(image, x.reshape(250, 400), y.reshape(250, 400), nearest=nearest)
-    assert np.abs(folded.reshape(expected.shape) - expected).max() <= step + 1e-6
-    assert look_up(image, x[:0], y[:0], nearest=nearest).shape == (0, *shape[2:])
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
@@ -103,31 +72,6 @@ def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens, fishey
     assert all((d.error[d.inverse > 0] > 0).all() and not d.error[d.inverse == 0].any() for _, d in found)
 
 
-def test_images_are_compared_with_those_that_are_named(tmp_path):
-    """Thirteen frames a step of 1 cm apart: hardly any parallax to the nearest ones, and enough to every sixth."""
-    poses = [np.array(POSES[0]) for _ in range(13)]
-    for n, pose in enumerate(poses):
-        pose[0, 3] += 0.01 * n
-    images, covers = scene_of(tmp_path, poses), []
-    for among in (None, [0, 6, 12]):
-        depths = list(find_depths(images, lambda i: points_on_walls(poses[i]), WIDTH, among=among))
-        covers.append(np.mean([(d.inverse > 0).mean() for _, d in depths]))
-    assert covers[0] < 0.3 and covers[1] > 0.95
-    assert np.median(relative_errors(depths, poses)[0]) < 0.0015
-
-
-def test_rough_points_are_no_more_than_a_start(tmp_path):
-    """Points a fifth too far: the depths found are those of the images."""
-    images = scene_of(tmp_path, POSES)
-
-    def too_far(i):
-        center = POSES[i][:, 3]
-        return center + 1.2 * (points_on_walls(POSES[i]) - center)
-
-    error, _ = relative_errors(list(find_depths(images, too_far, WIDTH)), POSES)
-    assert np.median(error) < 0.015
-
-
 def test_without_points_nothing_false_is_believed(tmp_path):
     images = scene_of(tmp_path, POSES)
     found = list(find_depths(images, lambda i: np.zeros((0, 3)), WIDTH))
@@ -159,93 +103,6 @@ def test_a_wrong_pose_gives_few_depths(tmp_path):
     assert known[1] < 0.3 * known[0]
 
 
-def test_equal_images_give_equal_depths(tmp_path):
-    images = scene_of(tmp_path, POSES[:3])
-    a, b = (list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH)) for _ in range(2))
-    assert all(
-        np.array_equal(x.inverse, y.inverse) and np.array_equal(x.error, y.error)
-        for (_, x), (_, y) in zip(a, b, strict=True)
-    )
-
-
-def test_depths_do_not_depend_on_the_number_of_threads(tmp_path, monkeypatch):
-    images = scene_of(tmp_path, POSES)
-    results, pools, executor = [], [], dense.ThreadPoolExecutor
-    monkeypatch.setattr(dense, "ThreadPoolExecutor", lambda count: pools.append(count) or executor(count))
-    for threads in (1, 4):
-        monkeypatch.setattr(dense, "num_threads", lambda count=threads: count)
-        results.append(list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH)))
-    for (_, one), (_, four) in zip(*results, strict=True):
-        assert np.array_equal(one.inverse, four.inverse) and np.array_equal(one.error, four.error)
-    assert pools == [1, 4]
-
-
-def test_each_image_is_shown_twice_and_finished_once(tmp_path):
-    images, shown = scene_of(tmp_path, POSES[:3]), []
-
-    def progress(work, count):
-        shown.append(count)
-        for result in work:
-            shown.append(result)
-            yield result
-
-    threads = dense.cv2.getNumThreads()
-    shape_of = lambda i, view, depth: (i, depth.inverse.shape)  # noqa: E731
-    results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH, shape_of, progress))
-    assert results == [(i, (HEIGHT, WIDTH)) for i in range(3)] and shown[0] == 6 and len(shown) == 7
-    assert shown[4:] == [(True, result) for result in results] and not any(is_last for is_last, _ in shown[1:4])
-    assert dense.cv2.getNumThreads() == threads, "OpenCV's setting is left as it was"
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("is_in_order", [True, False])
-def test_images_are_in_memory_while_their_neighbours_are_worked_on(tmp_path, monkeypatch, threads, is_in_order):
-    """Of a walk in order few at once; of one out of order as many as it takes, with the same depths."""
-    count = 40
-    places = np.arange(count) if is_in_order else np.random.default_rng(0).permutation(count)
-    poses = np.tile(np.eye(4)[:3], (count, 1, 1))
-    poses[:, 0, 3] = places + 0.1 * np.sin(places)  # no two as far apart as two others
-    images = replace(scene_of(tmp_path, POSES[:1]), files=(tmp_path,) * count, camera_to_worlds=poses)
-    alive, most = [], 0
-
-    def load(images, i, width):
-        nonlocal most
-        view = View(np.full((2, 2), i, np.uint8), np.ones(4), images.camera_to_worlds[i], np.ones((2, 2), bool))
-        alive.append(weakref.ref(view.gray))
-        most = max(most, sum(ref() is not None for ref in alive))
-        return view
-
-    monkeypatch.setattr(dense, "load_view", load)
-    monkeypatch.setattr(dense, "num_threads", lambda: threads)
-    at = lambda views: {v.pose[0, 3] for v in views}  # noqa: E731
-    monkeypatch.setattr(dense, "matched", lambda view, others, points, _: (view.pose[0, 3], at(others)))
-    monkeypatch.setattr(dense, "confirmed", lambda view, depth, others: (depth, at(v for v, _ in others)))
-    shown = lambda i, view, depth: (i, view.pose[0, 3], depth)  # noqa: E731
-    results = list(find_depths(images, lambda i: np.zeros((0, 3)), 2, shown))
-    x = poses[:, 0, 3]
-    for i, (number, place, ((mine, others), again)) in enumerate(results):
-        nearest = np.sort(np.abs(x - x[i]))[1 : dense.NEIGHBOURS + 1]
-        assert number == i and place == mine == x[i] and others == again
-        assert np.allclose(sorted(abs(other - x[i]) for other in others), nearest)
-    assert len(results) == len(alive) == count and (not is_in_order or most <= 9 + threads)
-
-
-def test_a_first_round_at_half_size_gives_the_depths_of_full_size(tmp_path, monkeypatch):
-    images = scene_of(tmp_path, POSES)
-    monkeypatch.setattr(dense, "LARGE", 40)
-    results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
-    error, scaled = relative_errors(results, POSES)
-    assert np.mean([(d.inverse > 0).mean() for _, d in results]) > 0.88
-    assert np.median(error) < 0.003 and np.quantile(scaled, 0.9) < 2
-
-
-@pytest.mark.parametrize("width", [2, 11, 16, 24, 32])
-def test_images_of_few_pixels_are_matched_at_their_size_alone(tmp_path, width):
-    images = scene_of(tmp_path, POSES)
-    results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), width, rounds=(2, 1)))
-    assert all(max(d.inverse.shape) == width and np.isfinite(d.inverse).all() for _, d in results)
-
-
 def mean_of(values, weights):
     """The mean of measurements of one pixel, and its error."""
     columns = (torch.tensor(each).reshape(-1, 1, 1) for each in (values, weights))
@@ -258,41 +115,9 @@ def test_measurements_that_agree_are_averaged_by_certainty():
     assert error == pytest.approx(np.sqrt(1 / 5e4))
 
 
-def test_an_error_is_never_less_than_the_scatter_says():
-    """Errors of 0.01 each, values 0.03 apart: they agree (2.5 of sqrt 2 times 0.01), and scatter by 4.5 variances."""
-    assert mean_of((1.0, 1.03), (1e4, 1e4))[1] == pytest.approx(np.sqrt(4.5 / 2e4), rel=1e-4)
-
-
-@pytest.mark.parametrize("values", [(1.0, 1.2, 1.4), (1.0, 1.2, 0.0), (-1.0, -1.0, 0.0)])
-def test_what_no_two_of_several_measurements_say_is_not_known(values):
-    assert mean_of(values, [1e4 if value else 0.0 for value in values]) == (0, 0)
-
-
-def test_a_measurement_without_another_counts():
-    assert mean_of((0.0, 1.0, 0.0), (0.0, 1e4, 0.0)) == (1, pytest.approx(0.01))
-
-
-def test_a_depth_of_large_error_is_not_kept():
-    assert mean_of((1.0, 1.0), (10.0, 10.0))[0] == 0
-    assert mean_of((1.0, 1.0), (5000.0, 5000.0))[0] > 0
-
-
 def flat_view(tmp_path, pose, gray=128):
     view = load_view(scene_of(tmp_path, [pose]), 0, WIDTH)
     return replace(view, gray=np.full_like(view.gray, gray))
-
-
-def test_the_fringe_of_a_foreground_goes_where_it_has_no_texture_of_its_own(tmp_path):
-    view = flat_view(tmp_path, POSES[0])
-    inverse = np.full(view.gray.shape, 0.1, F32)
-    inverse[:, 100:] = 0.5
-    depth = Depth(inverse, 0.001 * inverse)
-    kept = without_fringes(view, depth).inverse > 0
-    half = dense.EDGE // 2
-    assert kept[:, :100].all() and not kept[:, 100 : 100 + half].any() and kept[:, 100 + half :].all()
-    rng = np.random.default_rng(0)
-    textured = replace(view, gray=rng.integers(0, 255, view.gray.shape, dtype=np.uint8))
-    assert (without_fringes(textured, depth).inverse > 0).mean() > 0.99
 
 
 def test_a_depth_counts_where_another_image_confirms_it_and_no_more_see_through_it(tmp_path):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import pytest
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.data.priors import UNKNOWN, DepthPriors, packed
 from mmpi_ns.placement.observations import Observations
-from mmpi_priors import depth_priors
 from mmpi_priors.dense import Depth
 from mmpi_priors.depth_priors import POINT_ERROR, SENSOR_ERROR, at_training_pixels, with_points, with_sensor
 from mmpi_priors.views import View
@@ -41,16 +38,6 @@ def slanted(pinhole, shape):
     """Inverse depth of a slanted plane: affine in the pinhole's pixels."""
     y, x = np.meshgrid(np.arange(shape[0]) + 0.5, np.arange(shape[1]) + 0.5, indexing="ij")
     return 0.5 + 0.2 * (x - pinhole[2]) / pinhole[0] + 0.1 * (y - pinhole[3]) / pinhole[1]
-
-
-def test_a_panorama_wider_than_sixteen_bits_count_gets_its_distances():
-    posed, shape = camera(), (HEIGHT, 50_000)
-    pinhole = posed.intrinsics[0]
-    inverse = slanted(pinhole, (HEIGHT, WIDTH)).astype(F32)
-    view = View(np.zeros((HEIGHT, WIDTH), np.uint8), pinhole, posed.camera_to_worlds[0], np.ones((HEIGHT, WIDTH), bool))
-    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, shape)
-    same_size = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (HEIGHT, WIDTH))
-    assert found[:, 312::625, 0] == pytest.approx(same_size[..., 0], rel=0.02)
 
 
 @pytest.mark.parametrize(("lens", "fisheye"), [((0, 0, 0, 0), False), ((0.1, -0.05, 0.002, -0.001), False),
@@ -99,15 +86,6 @@ def test_areas_take_the_mean_by_certainty_and_edges_have_large_errors():
     assert mean[0] == pytest.approx([0.5, 0.5, 0.1, 0.7]) and spread[0, :3] == pytest.approx([0.01] * 3, rel=1e-3)
     assert spread[0, 3] == pytest.approx(np.hypot(0.2, 0.01), rel=1e-3)
     assert mean[1, 0] == 0 and mean[1, 1] == pytest.approx(0.5)  # nothing known; half of the area known
-
-
-def test_stored_distances_are_off_by_a_tenth_of_their_least_error_and_0_stays_unknown():
-    numbers = (
-        np.concatenate([[0.0], 10 ** np.random.default_rng(0).uniform(-9, 9, 9999)]).astype(F32).reshape(50, 100, 2)
-    )
-    found = DepthPriors([packed(numbers)]).image(0)
-    assert np.allclose(found, numbers, rtol=STEP, atol=0) and STEP < 0.1 * min(POINT_ERROR, SENSOR_ERROR)
-    assert found[0, 0, 0] == 0 and (found.reshape(-1)[1:] > 0).all()
 
 
 def nothing_known():
@@ -162,19 +140,6 @@ def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
     assert (found[30:] == 0.25).all() and found[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
 
 
-def test_depth_images_of_images_that_are_reduced_when_they_are_read_show_the_whole(tmp_path):
-    depth = np.full((HEIGHT, WIDTH), 2000, np.uint16)
-    depth[:, WIDTH // 2 :] = 4000
-    cv2.imwrite(str(tmp_path / "d.png"), depth)
-    posed = photographed(tmp_path)
-    half = replace(posed, intrinsics=posed.intrinsics / 2, sizes=posed.sizes / 2)
-    nothing = DepthPriors([packed(np.zeros((HEIGHT // 2, WIDTH // 2, 2)))])
-    distances = 1 / with_sensor(nothing, [tmp_path / "d.png"], 1e-3, half).image(0)[15, :, 0]
-    longer = np.sqrt(((np.arange(40) + 0.5 - 20) / 30) ** 2 + (0.5 / 30) ** 2 + 1)
-    assert distances[:20] == pytest.approx(2 * longer[:20], rel=1e-3)
-    assert distances[20:] == pytest.approx(4 * longer[20:], rel=1e-3)
-
-
 def test_a_sensor_and_matches_that_contradict_each_other_are_both_left_out(tmp_path):
     depth = np.full((HEIGHT, WIDTH), 2000, np.uint16)
     depth[:, 40:] = 0
@@ -199,29 +164,3 @@ def test_a_depth_image_that_cannot_be_read_is_named(tmp_path, content):
         file.write_bytes(content)
     with pytest.raises(ValueError, match=r"lost\.png"):
         with_sensor(DepthPriors([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [file], 1e-3, photographed(tmp_path)).image(0)
-
-
-def test_the_observations_need_no_points():
-    observations = seen(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)))
-    assert with_points(nothing_known(), observations).share == 0
-
-
-def test_threads_read_cached_depths_one_at_a_time(monkeypatch):
-    """numpy parses the headers of their files with ast, which fails at times in threads of CPython 3.11."""
-    reading, most = [], []
-
-    class Arrays(dict):
-        def __getitem__(self, name):
-            reading.append(name)
-            most.append(len(reading))
-            time.sleep(0.002)
-            reading.remove(name)
-            return super().__getitem__(name)
-
-    codes = packed(np.full((HEIGHT, WIDTH, 2), 0.25))
-    monkeypatch.setattr(depth_priors, "kept", lambda *_: Arrays({f"{i}": codes for i in range(20)}))
-    known = depth_priors._kept("", None, (), list)
-    with ThreadPoolExecutor(8) as pool:
-        images = list(pool.map(known.image, range(20)))
-    assert len(images) == 20 and (images[0] == 0.25).all()
-    assert max(most) == 1

@@ -140,42 +140,8 @@ def test_the_most_alike_depths_are_those_of_single_pixels(count, seed, ahead, pa
     assert (inverse == np.where(alike > -1, depths[np.argmax(alone, 0)], 0)).all()
 
 
-def test_one_image_is_half_of_a_pair():
-    scene, depths, least = a_scene(1, 4), np.float32([0.2]), np.zeros(SHAPE, np.float32)
-    gray, grays, marks, *places = scene
-    unmarked = gray, grays, [np.zeros_like(marks[0])], *places
-    alone, pair = (asked(unmarked, depths, least, 1.0, pairs)[0][0] for pairs in (False, True))
-    assert pair == pytest.approx((alone - 1) / 2, abs=1e-6) and (alone > 0).any()
-
-
-@pytest.mark.parametrize("value", [0, 1, 255])
-def test_images_of_one_pixel(value):
-    """Nothing, or no texture."""
-    one = np.full((1, 1), value, np.uint8)
-    eye, none = np.eye(3, dtype=np.float32)[None], np.zeros((1, 3), np.float32)
-    scene = np.full((1, 1), 9, np.uint8), [one], [np.ones((1, 1), np.uint8)], eye, none
-    alike, inverse = asked(scene, np.float32([0.5]), np.zeros((1, 1), np.float32), 1.0, False)
-    assert alike.ravel().tolist() == ([-1, -1, 0] if value else [-1, -1, -1])
-    assert inverse.ravel().tolist() == ([0, 0, 0.5] if value else [0, 0, 0])
-
-
-def test_without_depths_nothing_is_alike():
-    alike, inverse = asked(a_scene(2, 0), np.zeros(0, np.float32), np.zeros(SHAPE, np.float32), 1.0, False)
-    assert (alike == -1).all() and (inverse == 0).all() and alike.shape == (3, *SHAPE)
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38, -1e38])
 def test_inverse_depths_that_are_none_show_nothing_or_are_numbers(value):
     scene = a_scene(2, 5)
     alike, _ = asked(scene, np.float32([value]), np.zeros(SHAPE, np.float32), 1.0, False)
     assert np.isfinite(alike).all() and (np.isfinite(value) or (alike == -1).all())
-
-
-def test_an_image_is_like_itself():
-    gray, *_ = a_scene(1, 6)
-    eye, none = np.eye(3, dtype=np.float32)[None], np.zeros((1, 3), np.float32)
-    scene = gray, [gray], [np.zeros(SHAPE, np.uint8)], eye, none
-    alike, _ = asked(scene, np.float32([0.0]), np.zeros(SHAPE, np.float32), 1.0, False)
-    textured = cv2.blur(gray.astype(float) ** 2, (7, 7), borderType=cv2.BORDER_REPLICATE)
-    textured = textured - cv2.blur(gray.astype(float), (7, 7), borderType=cv2.BORDER_REPLICATE) ** 2 > 1.5
-    assert alike[0][textured] == pytest.approx(1, abs=1e-5) and textured.mean() > 0.5

@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.model_components.ray_generators import RayGenerator
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_ns.data.priors import DepthPriors, packed
-from mmpi_priors import depth_priors
-from mmpi_priors.depth_priors import with_continued
 from mmpi_priors.lone_depth import LEAST_ERROR, MOST_ERROR, continued, is_lone
 
 F32 = np.float32
@@ -85,19 +77,6 @@ def test_nothing_known_or_everything_known_adds_nothing():
     assert not continued(seen(plane((0, 0, -1), 5, d), np.ones((HEIGHT, WIDTH), bool)), d).any()
 
 
-def test_the_trusted_of_two_surfaces_is_continued():
-    """A near wall known badly over a far one known well: the far one goes on."""
-    d, rng = directions(), np.random.default_rng(2)
-    far, near = plane((0, 0, -1), 10, d), plane((0, 0, -1), 9, d)
-    bad = rng.random((HEIGHT, WIDTH)) < 0.5
-    known = seen(far, middle())
-    known[bad] = seen(near, middle(), error=0.5)[bad]
-    found = continued(known, d)
-    added = found[..., 0] > 0
-    assert added.any()
-    assert np.abs(found[added][:, 0] / far[added] - 1).max() < 0.01
-
-
 def posed(*places, lens=(0.0, 0.0, 0.0, 0.0)):
     """Cameras that look along -z from these places."""
     poses = np.tile(np.eye(4)[:3], (len(places), 1, 1))
@@ -116,54 +95,3 @@ def test_a_point_is_lone_that_at_most_one_other_image_shows():
     assert is_lone(images, 1, points[:1]).tolist() == [False]
     assert is_lone(posed((0, 0, 0)), 0, points).tolist() == [True] * 4
     assert is_lone(images, 0, np.zeros((0, 3))).shape == (0,)
-
-
-def test_lone_points_are_those_of_every_image_by_itself():
-    rng = np.random.default_rng(0)
-    images = posed(*rng.uniform(-2, 2, (9, 3)))
-    points = rng.uniform([-12, -9, -15], [12, 9, 1], (5000, 3))
-    count = np.zeros(len(points), int)
-    for j in range(1, 9):
-        away = points - images.camera_to_worlds[j, :, 3]
-        x, y = (FOCAL * away[:, k] / np.minimum(away[:, 2], -1e-9) for k in (0, 1))
-        count += (away[:, 2] < 0) & (np.abs(x) <= WIDTH / 2) & (np.abs(y) <= HEIGHT / 2)
-    assert np.array_equal(is_lone(images, 0, points), count <= 1) and {0, 1, 2, 3} <= set(count)
-
-
-@pytest.mark.parametrize("between", [0, 1])
-@pytest.mark.parametrize("most", [320, 50, 40])
-def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, monkeypatch, tmp_path):
-    """Images along the way to a wall: of the first one's border, what at most one of the others shows.
-
-    Also where every second or third pixel is looked at; then a pixel at the border of what others show may go either
-    way.
-    """
-    monkeypatch.setattr(depth_priors, "CONTINUED", most)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    stops = [0.0, 4.0, *[4.0] * between]
-    images, d = posed(*[(0, 0, -z) for z in stops]), directions()
-    known = [seen(plane((0, 0, -1), 10 - z, d), middle()) for z in stops]
-    cameras = Cameras(
-        torch.tensor(images.camera_to_worlds).float(), FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, width=WIDTH, height=HEIGHT
-    )
-    usable = np.ones((HEIGHT, WIDTH), bool)
-    dataset: Any = SimpleNamespace(has_masks=False, usable=lambda i: usable)
-    rays = RayGenerator(cameras)
-    found = with_continued(DepthPriors(list(map(packed, known))), images, dataset, rays)
-    again = with_continued(DepthPriors(list(map(packed, known))), images, dataset, rays)
-    assert all(np.array_equal(a, b) for a, b in zip(found.codes, again.codes, strict=True))
-    usable[:3] = False
-    dataset.has_masks = True
-    masked = with_continued(DepthPriors(list(map(packed, known))), images, dataset, rays).image(0)
-    assert not masked[:3].any() and np.count_nonzero(masked) > 0.8 * np.count_nonzero(found.image(0)[3:])
-    first, exact = found.image(0), plane((0, 0, -1), 10, d)
-    points = d / exact[..., None]
-    shown = np.maximum(np.abs(points[..., 0]) / 0.8, np.abs(points[..., 1]) / (HEIGHT / 2 / FOCAL)) <= 6 - (most < 320)
-    added = (first[..., 0] > 0) & ~middle()
-    assert added[~shown & ~middle()].mean() > 0.8
-    if between:  # two others show it
-        assert not added[shown].any()
-    else:
-        assert added[~middle()].mean() > 0.8
-    assert first[added][:, 0] == pytest.approx(exact[added], rel=0.02)
-    assert np.array_equal(first[middle()], DepthPriors(list(map(packed, known))).image(0)[middle()])

@@ -9,7 +9,7 @@ import pytest
 
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
-from mmpi_priors.clouds import FARTHEST, MOST_POINTS, see_points, usable_points
+from mmpi_priors.clouds import see_points
 
 BACK = np.concatenate([np.diag([-1.0, 1, -1]), np.zeros((3, 1))], 1)
 SIZE = np.array([400.0, 300])
@@ -113,18 +113,3 @@ def test_a_cloud_in_another_unit_does_not_fit(scale, fits):
     assert seen.fits == fits
     assert ("does not fit the images" in seen.describe()) != fits
     assert see_points(points, cameras(AHEAD)).fits
-
-
-def test_of_an_absurd_cloud_the_usable_points_stay(capsys):
-    centers = np.array([[0.0, 0, 0], [1, 0, 0]])
-    points = np.array([[1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0], [0, 2 * FARTHEST, 0], [1e30, 0, 0], [4, 5, 6.0]])
-    assert usable_points(points, centers).tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert len(usable_points(points, centers[:1])) == 4  # one place has no extent
-    assert "4 of 6 points of the point cloud are not used" in " ".join(capsys.readouterr().out.split())
-
-
-def test_of_a_laser_scan_the_same_points_are_used_each_time():
-    points = np.arange(3.0 * (MOST_POINTS + 9)).reshape(-1, 3)
-    centers = np.array([[0.0, 0, 0], [1e3, 0, 0]])
-    first, second = usable_points(points, centers), usable_points(points, centers)
-    assert len(first) == MOST_POINTS and np.array_equal(first, second) and (np.diff(first[:, 0]) > 0).all()

@@ -166,8 +166,3 @@ def test_the_largest_group_that_agrees_is_averaged(measurements):
     expected = np.array([averaged_slowly(q, w) for q, w in pixels])
     same = np.isclose(mean, expected[:, 0], rtol=1e-5) & np.isclose(error, expected[:, 1], rtol=1e-3)
     assert same.mean() > 0.995 and (mean > 0).mean() > 0.3  # ties may fall either way
-
-
-def test_wrong_shapes_are_refused():
-    with pytest.raises(ValueError, match="has the shape"):
-        average_matches(torch.ones(3, 1, 5), torch.ones(3, 1, 4), MOST_RELATIVE)

@@ -49,25 +49,6 @@ def test_the_share_that_lies_below_the_road_is_told_and_doubted(sunken):
     assert sunken < SUNK or f"{sunk(shots):.0%} of what lies below" in doubt(shots)
 
 
-def test_what_is_masked_is_not_doubted():
-    shots = shots_of(sunken=0.3)
-    masks = [shot.depth.inverse < 0.5 * shot.ground for shot in shots]
-    assert sunk(shots, masks) == 0 and not doubt(shots, masks)
-
-
-def test_where_no_height_of_the_camera_stands_out_nothing_is_said():
-    assert sunk(shots_of(heights=HEIGHT * 1.6 ** np.arange(MANY))) == 0
-    assert sunk(shots_of(known=0.02)) == 0, "few depths"
-    assert not doubt(shots_of(MANY - 1, sunken=0.4)), "few shots"
-
-
-def test_a_drive_without_a_road_is_doubted_and_a_camera_that_looks_aside_is_not():
-    blind = shots_of(known=0.0, has_ground=False)
-    assert f"the road is found in 0 of {MANY} images" in doubt(blind)
-    assert not doubt(shots_of(MANY // 4) + blind[MANY // 4 :]), "found in a quarter"
-    assert not doubt(shots_of(turn=ASIDE, known=0.0, has_ground=False))
-
-
 def test_of_a_camera_that_is_no_car_nothing_is_said():
     assert not doubt(shots_of(sunken=0.4, turn=ASIDE)), "it looks aside"
     assert doubt(shots_of(sunken=0.4)) and not doubt(shots_of(sunken=0.4, heights=30.0)), "a drone far above a shore"
@@ -77,8 +58,3 @@ def test_of_a_camera_that_is_no_car_nothing_is_said():
             yaw = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
             shot.view.pose[:, :3] = shot.view.pose[:, :3] @ yaw
         assert not doubt(by_hand), "a hand turns it"
-
-
-def test_a_doubt_says_for_what_captures_it_is():
-    assert doubt(shots_of(sunken=0.4)).startswith("This looks like a drive along a road.")
-    assert doubt(shots_of(known=0.0, has_ground=False)).startswith("This looks like a drive straight ahead.")

@@ -10,7 +10,7 @@ import pytest
 
 from mmpi_priors.dense import Depth
 from mmpi_priors.moving_evidence import Neighbour, Shot
-from mmpi_priors.moving_sweep import floats, is_straight, solid, sweep
+from mmpi_priors.moving_sweep import floats, sweep
 from mmpi_priors.views import View
 
 SIZE, FOCAL, HEIGHT = (160, 240), 200.0, 1.5
@@ -101,30 +101,3 @@ def test_a_box_in_the_air_floats_and_one_on_the_ground_does_not(over_ground, sha
     assert seen[70:100, 60:90].mean() >= share
     seen[70:100, 60:90] = False
     assert not seen.any()
-
-
-def test_a_box_above_something_that_stands_does_not_float():
-    inverse = ground()
-    inverse[70:100, 60:90], inverse[100:112, 60:90] = 2 * inverse[100, 0], 1.38 * inverse[100, 0]
-    assert not floats(inverse, ground()).any()
-
-
-def test_cameras_beside_the_line_are_not_straight():
-    view = View(np.zeros(SIZE, np.uint8), PINHOLE, np.eye(4)[:3], np.ones(SIZE, bool))
-
-    def at(*center):
-        return replace(view, pose=np.concatenate([np.eye(3), np.reshape(center, (3, 1))], 1))
-
-    assert is_straight([at(0, 0, 0), at(0, 0.02, 1), at(0, 0, 2.5)])
-    assert not is_straight([at(0, 0, 0), at(0, 0.5, 1), at(0, 0, 2.5)])
-    assert not is_straight([at(0, 0, 0), at(0, 0, 1)])
-
-
-def test_specks_lines_and_what_is_in_the_sky_are_not_solid():
-    moves = np.zeros(SIZE, bool)
-    moves[80:95, 20:40] = moves[10:25, 20:40] = moves[110:113, 110:113] = moves[140] = True
-    moves[40:64, 100:120] = True  # a sixth of it below the horizon
-    kept = solid(moves, ground())
-    assert kept[82:93, 22:38].all()
-    kept[78:97, 18:42] = False
-    assert not kept.any()

@@ -126,12 +126,6 @@ def test_a_depth_that_the_other_image_contradicts_is_no_point():
     assert not (points.pixels[:, 0] == 0).any() and not (points.other == 0).any() and len(points.other) > 100
 
 
-def test_an_uncertain_or_unknown_depth_is_no_point():
-    assert find(exact_depths(0.05)) is None
-    assert find(DepthPriors([packed(np.zeros_like(exact_depths().image(i))) for i in range(6)])) is None
-    assert find(images=[2]) is None, "one image has nobody to share with"
-
-
 def test_masks_and_transparent_pixels_are_left_out():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, : WIDTH // 2] = 0
@@ -142,35 +136,6 @@ def test_masks_and_transparent_pixels_are_left_out():
     points = find(dataset=Images(alpha={0: opacity}))
     assert points.colors.shape[-1] == 4 and (points.colors[..., 3] == 255).all()
     assert (points.pixels[points.pixels[:, 0] == 0][:, 1] < HEIGHT // 2).all()
-
-
-def test_what_is_kept_is_bounded_and_spread_over_the_images(monkeypatch):
-    monkeypatch.setattr(new_views, "MOST", 480)
-    points = find()
-    assert 240 < len(points.other) <= 480 and set(points.pixels[:, 0].tolist()) == set(range(len(TRAIN)))
-    assert torch.equal(points.pixels, find().pixels), "the same with each start"
-
-
-def test_the_number_of_threads_does_not_change_the_points(monkeypatch):
-    monkeypatch.setattr(new_views, "MOST", 1000)
-    points = []
-    for threads in (1, 3):
-        monkeypatch.setattr("mmpi_ns.utils.parallel.num_threads", lambda threads=threads: threads)
-        points.append(find())
-    for name in ("pixels", "other", "colors", "depths"):
-        assert torch.equal(*(getattr(p, name) for p in points))
-
-
-def test_some_images_alone():
-    some = find().of_images(torch.tensor([1, 2, 3]))
-    assert set(some.pixels[:, 0].tolist()) | set(some.other.tolist()) == {1, 2, 3}
-    assert find().of_images(torch.tensor([4])) is None
-
-
-def test_a_draw_depends_on_the_generator_alone():
-    points = find()
-    assert all(np.array_equal(a, b) for a, b in zip(drawn(points, 50), drawn(points, 50), strict=True))
-    assert not np.array_equal(drawn(points, 50)[0], drawn(points, 50, seed=1)[0])
 
 
 @pytest.mark.parametrize(
@@ -202,21 +167,3 @@ def test_a_point_of_another_colour_in_the_other_image_is_no_point():
     points = find(dataset=Changed())
     with_first = (points.pixels[:, 0] == 0) | (points.other == 0)
     assert with_first.sum() < 0.04 * len(with_first) and len(with_first) > 1000
-
-
-def test_an_image_of_more_points_than_sixteen_bits_count():
-    """Photos of ordinary size: 11 of 1416 x 1064 came to more than 32,767 points an image."""
-    count = 100_000
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(1, WIDTH - 1, count), rng.uniform(1, HEIGHT - 1, count)
-    pose = POSES[1]
-    local = np.stack([(x - WIDTH / 2) / FOCAL, (HEIGHT / 2 - y) / FOCAL, -np.ones(count)], -1)
-    points = 2.5 * local @ pose[:, :3].T + pose[:, 3]
-    image = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    depth = np.zeros((HEIGHT, WIDTH, 2), np.float32)
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    depth[..., 0] = 0.4 / np.sqrt(((columns - WIDTH / 2) / FOCAL) ** 2 + ((HEIGHT / 2 - rows) / FOCAL) ** 2 + 1)
-    own = image[y.astype(int), x.astype(int)]
-    usable = np.ones((HEIGHT, WIDTH), np.uint8)
-    seen, colors = new_views.ShownImage.of(image, usable, depth).shows(posed(), 1, points, own)
-    assert np.array_equal(seen, np.arange(count)) and colors.shape == (count, 3)

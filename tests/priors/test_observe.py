@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,15 +12,10 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 from tiny_scene import write_colmap
 
-from mmpi_ns.data.checks import say_once
 from mmpi_ns.data.posed_images import PosedImages, posed_images
 from mmpi_ns.placement.observations import Observations
-from mmpi_priors import observe as mmpi_observations
 from mmpi_priors.observe import (
-    ENOUGH_KEYPOINTS,
     drop_masked,
-    observe,
-    read_observations,
     tell_poses,
     with_surfaces,
     with_tracks,
@@ -90,10 +84,6 @@ def test_a_lens_goes_to_colmap_in_its_order(kind, used):
     assert not posed_images(bare(), as_data(kind=kind)).distortion.any()
 
 
-def test_other_cameras_are_not_triangulated():
-    assert posed_images(bare(), as_data(kind=CameraType.EQUIRECTANGULAR)) is None
-
-
 def model(*keypoints) -> SfmModel:
     """Tracks (camera, point, share of the width, share of the height) of four points."""
     rows = np.array([(row, *k[1:]) for row, name in enumerate((1, 0)) for k in keypoints if k[0] == name])
@@ -106,20 +96,6 @@ def test_tracks_come_in_pixels_of_the_camera_whose_place_names_them():
     assert found.seen_by.tolist() == [0, 1, 1] and found.seen_point.tolist() == [2, 3, 2]
     assert found.seen_at == pytest.approx(np.array([[10, 10], [60, 6], [40, 30]]))
     assert np.array_equal(found.points, np.arange(12.0).reshape(4, 3))
-
-
-@pytest.mark.parametrize(("each", "searched"), [(ENOUGH_KEYPOINTS, False), (ENOUGH_KEYPOINTS - 1, True)])
-def test_surfaces_are_searched_only_where_triangulation_finds_too_few_keypoints(monkeypatch, each, searched):
-    tracks = [(camera, 0, 0.5, 0.5) for camera in (0, 1) for _ in range(each)]
-    monkeypatch.setattr(mmpi_observations, "kept", lambda name, images, settings, find: find())
-    monkeypatch.setattr(mmpi_observations, "triangulate", lambda images: model(*tracks))
-    monkeypatch.setattr(mmpi_observations, "at_full_size", lambda images: images)
-    calls = []
-    monkeypatch.setattr(mmpi_observations, "with_surfaces", lambda found, images: calls.append(images) or found)
-    found = mmpi_observations._find_points(bare(), as_data(), True, lambda *_: False)
-    assert len(found.seen_by) == 2 * each and len(calls) == searched
-    mmpi_observations._find_points(bare(), as_data(), False, lambda *_: False)
-    assert len(calls) == searched + 1 and len(calls[-1].files) == 2
 
 
 @pytest.mark.parametrize("depth", [12.0, 120.0])
@@ -180,35 +156,3 @@ def test_points_that_project_badly_or_that_few_images_see_are_left_out(tmp_path)
     found = find_sfm_model(tmp_path / "model")
     assert found is not None and np.array_equal(found.points, np.delete(whole.points, 3, 0))
     assert len(found.seen_by) == len(whole.seen_by) - len(long[3][8:]) / 2
-
-
-def cloud_outputs() -> Any:
-    """Outputs of a data parser."""
-    return SimpleNamespace(
-        image_filenames=[f"frame_{i + 1:05d}.png" for i in (0, 1)],
-        metadata={},
-        dataparser_transform=torch.eye(4)[:3],
-        dataparser_scale=1.0,
-    )
-
-
-def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkeypatch, capsys):
-    say_once.cache_clear()
-    outputs, none = cloud_outputs(), (SimpleNamespace(data=tmp_path), Path("none"))
-    cameras = as_data().cameras
-    cloud = np.array([[0, 0.1, -3.0], [np.nan, 0, 0]])
-    monkeypatch.setattr(mmpi_observations, "point_cloud", lambda *_: cloud)
-    waiting = read_observations(outputs, cameras, None, cloud)
-    assert waiting.loose is not None and not len(waiting.points)
-    assert waiting.loose == pytest.approx(np.array([[0, 0.1, -3]]), abs=1e-6)
-    monkeypatch.setattr(mmpi_observations, "_find_points", lambda found, *_: found)
-    data = as_data()
-    assert observe(outputs, data, *none, find_points=True, triangulates=True, trusts=False).loose is not None
-    names, seen_point = np.array(outputs.image_filenames), np.zeros(2, int)
-    tracks = SfmModel(np.array([[0.0, 0, -3]]), names, np.arange(2), seen_point, np.full((2, 2), 0.5))
-    monkeypatch.setattr(mmpi_observations, "find_sfm_model", lambda folder: tracks)
-    monkeypatch.setattr(mmpi_observations, "drop_masked", lambda found, data: found)
-    say_once.cache_clear()
-    found = observe(outputs, data, *none, find_points=True, triangulates=True, trusts=False)
-    assert found.loose is None and len(found.points) == 1
-    assert "Point cloud: not used" in capsys.readouterr().out

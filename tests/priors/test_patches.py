@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mmpi_ns.ops import dispatch
-from mmpi_priors.ops.patches import Others, Patches, compare_planes, others_of, spread_planes
+from mmpi_priors.ops.patches import Patches, compare_planes, others_of, spread_planes
 
 HEIGHT, WIDTH, STRIDE, ALONE = 18, 37, 2, 0.1
 PINHOLE = np.array([40.0, 44.0, 17.0, 8.0])
@@ -181,65 +181,6 @@ def test_the_true_plane_is_alike_and_others_are_not():
     assert true.alike[inner].median() > 0.95 and (true.alike >= false.alike)[inner].float().mean() > 0.9
 
 
-def test_a_true_plane_spreads_to_the_pixels_around_it():
-    scene, planes = slanted_wall()
-    gray, others = operands(*scene)
-    start = torch.tensor([0.02, 0.0, 0.0]).repeat(HEIGHT, WIDTH, 1)
-    start[9, 18] = torch.from_numpy(planes[9, 18])
-    patches = compare_planes(gray, nothing(start), start, others, STRIDE)
-    unchanged = torch.zeros(HEIGHT, WIDTH, 4)
-    spread = spread_planes(gray, patches, unchanged, *floats(PINHOLE), others, STRIDE, 2)
-    assert (spread.alike >= patches.alike).all()
-    for row, column in ((7, 18), (11, 18), (9, 16), (9, 20)):
-        assert spread.planes[row, column].numpy() == pytest.approx(planes[row, column], rel=1e-4)
-    away = np.abs(spread.planes.numpy() - start.numpy()).max(-1) > 1e-6
-    assert away.sum() == 4
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_changed_planes_are_judged_as_what_they_are(seed):
-    """Whatever becomes of random planes, their correlations are those of the oracle, and no less than before."""
-    scene = random_scene(2, seed)
-    gray, others = operands(*scene)
-    rng = np.random.default_rng(seed)
-    planes = floats(rng.normal(size=(HEIGHT, WIDTH, 3)) * [0.2, 0.01, 0.01] + [0.4, 0, 0])[0]
-    before = compare_planes(gray, nothing(planes), planes, others, STRIDE)
-    changes = floats(rng.uniform(-0.5, 0.5, (HEIGHT, WIDTH, 4)))[0]
-    after = spread_planes(gray, before, changes, *floats(PINHOLE), others, STRIDE, 1)
-    assert (after.alike >= before.alike).all() and (after.alike > before.alike).float().mean() > 0.3
-    for r, c in np.ndindex(HEIGHT, WIDTH):
-        expected = alike(*scene, r, c, after.planes[r, c].double().numpy())
-        if not np.isnan(expected) and expected > -1:
-            assert float(after.alike[r, c]) == pytest.approx(expected, abs=3e-3)
-
-
-def test_planes_change_in_depth_and_direction():
-    """A pixel takes the better one of a plane at another depth and one that is turned."""
-    scene, planes = slanted_wall()
-    gray, others = operands(*scene)
-    off = planes * np.float32(2**-0.25)
-    changes = np.zeros((HEIGHT, WIDTH, 4))
-    changes[..., 0] = 0.25
-    start = compare_planes(gray, nothing(torch.from_numpy(off)), torch.from_numpy(off), others, STRIDE)
-    back = spread_planes(gray, start, *floats(changes, PINHOLE), others, STRIDE, 1)
-    inner = np.s_[4:-4, 4:-4]
-    same = np.abs(back.planes.numpy() / planes - 1).max(-1)[inner] < 1e-3
-    assert same.mean() > 0.8
-    # A fronto-parallel plane, whose normal is turned to the true one.
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    q, right, down = np.moveaxis(planes.astype(float), -1, 0)
-    fx, fy, cx, cy = PINHOLE
-    normal = np.stack([fx * right, fy * down, q - right * (x - cx) - down * (y - cy)], -1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    changes = np.concatenate([np.zeros((HEIGHT, WIDTH, 1)), normal - [0, 0, 1]], -1)
-    frontal = torch.from_numpy(np.stack([planes[..., 0], 0 * planes[..., 0], 0 * planes[..., 0]], -1))
-    start = compare_planes(gray, nothing(frontal), frontal, others, STRIDE)
-    turned = spread_planes(gray, start, *floats(changes, PINHOLE), others, STRIDE, HEIGHT + WIDTH)
-    better = (turned.alike > start.alike).numpy()
-    assert better.mean() > 0.5
-    assert turned.planes.numpy()[better] == pytest.approx(planes[better], rel=2e-3, abs=1e-6)
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38, -1e38, 0.0])
 def test_planes_that_are_none_are_never_taken(value):
     scene, planes = slanted_wall()
@@ -255,18 +196,3 @@ def test_planes_that_are_none_are_never_taken(value):
         assert torch.isfinite(after.alike).all() and torch.isfinite(after.planes).all()
         spread = spread_planes(gray, nothing(bad), torch.zeros(HEIGHT, WIDTH, 4), *floats(PINHOLE), others, STRIDE, 1)
         assert not spread.alike.isnan().any()
-
-
-def test_an_image_of_one_pixel_and_one_that_shows_nothing():
-    one = torch.full((1, 1), 9, dtype=torch.uint8)
-    linear, b = floats(np.eye(3)[None], np.zeros((1, 3)))
-    others = others_of([[one, one, one]], linear, b)
-    patches = compare_planes(one, nothing(torch.ones(1, 1, 3)), torch.ones(1, 1, 3), others, STRIDE)
-    assert float(patches.alike) == -1  # no texture
-    scene, planes = slanted_wall()
-    gray, others = operands(*scene)
-    aside = others.linear.clone()
-    aside[:, 0, 2] += 1e4
-    beside = Others(others.corners, others.levels, aside, others.b)
-    patches = compare_planes(gray, nothing(torch.from_numpy(planes)), torch.from_numpy(planes), beside, STRIDE)
-    assert (patches.alike == -1).all()

@@ -5,11 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-import pytest
 from value_noise import noise
 
-from mmpi_priors import dense
-from mmpi_priors.dense import ROUNDS, Depth, confirmed, matched
+from mmpi_priors.dense import ROUNDS, confirmed, matched
 from mmpi_priors.patches import Surfaces, search_surfaces
 from mmpi_priors.views import View
 
@@ -121,53 +119,3 @@ def test_where_nothing_can_be_compared_there_are_no_surfaces():
     blank = search_surfaces(blanks[1], blanks[::2], rough)
     assert blank is not None and not blank.error.any() and not blank.inverse.any()
     assert search_surfaces(view, [view, view], rough) is None  # no parallax
-
-
-@pytest.mark.parametrize("known", [0.3, 0.0])
-def test_two_images_are_enough_even_where_no_depth_is_known(known):
-    view, inverse = corridor(1)
-    surfaces = search_surfaces(view, [corridor(0)[0]], np.full(inverse.shape, known, np.float32))
-    assert surfaces is not None
-    q, error = surfaces.enlarged(inverse.shape)
-    certain = error > 0
-    assert certain.mean() > 0.3 and np.median(np.abs(q / inverse - 1)[certain]) < 0.03
-
-
-@pytest.mark.parametrize("size", [(1, 1), (3, 90), (12, 12), (40, 9)])
-def test_images_of_any_size_are_matched(size):
-    small = [View(np.zeros(size, np.uint8), np.array([9.0, 9, 4, 4]), v.pose, np.ones(size, bool)) for v in views()]
-    depth = matched(small[0], small[1:], few_points(0))
-    assert isinstance(depth, Depth) and depth.inverse.shape == size and not depth.inverse.any()
-
-
-def test_planes_fill_what_is_bare_and_not_the_gaps_between_measured_depths(monkeypatch):
-    measured = np.zeros((60, 100), np.float32)
-    measured[:, :50] = 2.0
-    measured[20:23, 20:23] = 0  # side of the square: 5 pixels
-    planes = np.zeros((30, 50, 3), np.float32)
-    planes[..., 0] = 1.0
-    surfaces = Surfaces(planes, np.full((30, 50), 0.2, np.float32))
-    monkeypatch.setattr(dense, "search_surfaces", lambda *_: surfaces)
-    monkeypatch.setattr(dense, "without_fringes", lambda *_: Depth(measured, 0.1 * measured))
-    blank, inside = np.zeros((60, 100), np.uint8), np.ones((60, 100), bool)
-    view = View(blank, np.array([90.0, 90, 50, 30]), np.eye(3, 4), inside)
-    depth = matched(view, [view], np.array([[0.0, 0, -1]]))
-    assert (depth.inverse[:, :50] == measured[:, :50]).all() and (
-        depth.error[:, :50] == np.float32(0.1) * measured[:, :50]
-    ).all()
-    assert (depth.inverse[:, 50:] == 1).all() and (depth.error[:, 50:] == np.float32(0.2)).all()
-
-
-def test_what_one_of_several_neighbours_shows_has_depths():
-    """The walls at the border of the last image but one: images further in have passed them."""
-    (view, inverse), others = corridor(1), [corridor(i)[0] for i in (0, 2, 3)]
-    surfaces = search_surfaces(view, others, np.full(inverse.shape, np.median(inverse), np.float32))
-    assert surfaces is not None
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
-    # A step further in, at this depth, they are outside of the image.
-    ahead = 1 / inverse - STEP
-    passed = (ahead <= 0) | (
-        np.maximum(np.abs(x) / WIDTH, np.abs(y) / HEIGHT) / inverse / np.maximum(ahead, 1e-9) > 0.5
-    )
-    right = np.abs(surfaces.enlarged(inverse.shape)[0] / inverse - 1) < 0.1
-    assert passed.mean() > 0.1 and right[passed].mean() > 0.15, (passed.mean(), right[passed].mean())

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pycolmap
 import pytest
 from PIL import Image
 from value_noise import noise
 
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
-from mmpi_priors import tracks as triangulation
 from mmpi_priors.observe import with_tracks
-from mmpi_priors.tracks import EFFORTS, NEIGHBOURS, near_pairs, triangulate
+from mmpi_priors.tracks import triangulate
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 180.0
 LENS = (0.05, -0.02, 0.001, -0.002)
@@ -112,58 +110,12 @@ def test_points_lie_on_the_walls(model):
     assert is_near_wall(model.points[near]).mean() > 0.97
 
 
-def test_ignoring_the_lens_would_misplace_the_points(images, model):
-    pinhole = triangulate(replace(images, distortion=np.zeros_like(images.distortion)))
-    assert np.median(depth_error(model.points)) < 0.5 * np.median(depth_error(pinhole.points))
-
-
 def test_a_fisheye_lens_is_taken_for_what_it_is(tmp_path):
     images = scene_of(tmp_path, POSES, (0.08, -0.03, 0.02, 0.01), fisheye=True)
     points = triangulate(images).points
     assert len(points) > 100 and np.median(depth_error(points)) < 0.005
     others = triangulate(replace(images, fisheye=False)).points
     assert not len(others) or np.median(depth_error(others)) > 0.01
-
-
-def test_perspective_and_fisheye_images_are_matched_with_each_other(tmp_path):
-    straight, round_ = (scene_of(tmp_path / str(f), POSES[f::2], LENS, fisheye=bool(f)) for f in range(2))
-    both = {
-        name: np.concatenate([getattr(straight, name), getattr(round_, name)])
-        for name in ("camera_to_worlds", "intrinsics", "sizes", "distortion")
-    }
-    is_fisheye = np.array([False] * len(straight.files) + [True] * len(round_.files))
-    both = PosedImages(files=straight.files + round_.files, **both, fisheye=is_fisheye)
-    found = triangulate(both)
-    assert len(found.points) > 100 and np.median(depth_error(found.points)) < 0.005
-    cameras, points, _ = keypoints_of(found, both)
-    mixed = [len(set(is_fisheye[cameras[points == p]])) == 2 for p in range(len(found.points))]
-    assert np.mean(mixed) > 0.5
-
-
-def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, images, monkeypatch):
-    efforts, faintest = [], []
-    extract, match = pycolmap.extract_features, pycolmap.match_image_pairs
-
-    def spy_extract(*args, extraction_options, **options):
-        faintest.append(extraction_options.sift.peak_threshold)
-        return extract(*args, extraction_options=extraction_options, **options)
-
-    def spy_match(*args, matching_options, verification_options, **options):
-        efforts.append((faintest[-1], matching_options.guided_matching, verification_options.min_num_inliers))
-        options |= {"matching_options": matching_options, "verification_options": verification_options}
-        return match(*args, **options)
-
-    monkeypatch.setattr(pycolmap, "extract_features", spy_extract)
-    monkeypatch.setattr(pycolmap, "match_image_pairs", spy_match)
-    faint = scene_of(tmp_path, POSES[:4], contrast=0.12)
-    points = triangulate(faint).points
-    assert efforts == list(EFFORTS) and len(faintest) == len(EFFORTS) and np.median(depth_error(points)) < 0.02
-    monkeypatch.setattr(triangulation, "EFFORTS", EFFORTS[:1])
-    assert len(triangulate(faint).points) < 0.5 * len(points)
-    monkeypatch.setattr(triangulation, "EFFORTS", (EFFORTS[1], EFFORTS[0]))
-    efforts.clear()
-    triangulate(images)
-    assert efforts == [EFFORTS[1]]
 
 
 def keypoints_of(model, images):
@@ -200,64 +152,8 @@ def test_disturbed_poses_show_in_the_matches_and_exact_ones_do_not(images, model
     assert off is not None and 0.6 < off * WIDTH < 2
 
 
-def test_poses_of_one_place_are_not_told_to_be_off(tmp_path):
-    """Images of one place have no epipolar lines: any match would be infinitely far from them."""
-    turned = scene_of(tmp_path, [pose_at(0.0, 0.02), pose_at(0.0, 0.05)])
-    assert np.ptp(turned.camera_to_worlds[:, :, 3], axis=0).max() == 0
-    assert np.isnan(triangulate(turned).off)
-
-
-def test_equal_images_give_equal_tracks(images, model):
-    again = triangulate(images)
-    assert all(np.array_equal(x, vars(again)[name]) for name, x in vars(model).items())
-
-
-def test_files_of_one_name_in_several_folders_stay_apart(tmp_path, model):
-    moved = scene_of(tmp_path, POSES, LENS)
-    files = []
-    for i, file in enumerate(moved.files):
-        (tmp_path / str(i)).mkdir()
-        files.append(file.rename(tmp_path / str(i) / "same.png"))
-    found = triangulate(replace(moved, files=tuple(files)))
-    assert np.array_equal(found.points, model.points)
-
-
-def test_one_image_gives_no_tracks(images):
-    rows = {f: getattr(images, f)[:1] for f in ("files", "camera_to_worlds", "intrinsics", "sizes", "distortion")}
-    assert len(triangulate(PosedImages(**rows)).points) == 0
-
-
-def test_images_that_show_nothing_in_common_give_no_tracks(tmp_path):
-    images = scene_of(tmp_path, POSES[:3])
-    for seed, file in enumerate(images.files):
-        gray = np.random.default_rng(seed).integers(0, 256, (HEIGHT // 4, WIDTH // 4), dtype=np.uint8)
-        Image.fromarray(gray).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(file)
-    assert len(triangulate(images).points) == 0
-
-
-def test_two_images_that_agree_are_enough(images):
-    two = {f: getattr(images, f)[:2] for f in ("files", "camera_to_worlds", "intrinsics", "sizes", "distortion")}
-    points = triangulate(PosedImages(**two)).points
-    assert len(points) > 30 and np.median(depth_error(points)) < 0.02
-
-
-def test_rays_half_a_degree_apart_are_enough_and_less_is_not(tmp_path):
-    """The near wall is three away, the far one five: angles of 1.1 and 0.7 degrees, or of 0.4 and 0.2."""
-    for step, least, most in ((0.06, 30, 1000), (0.02, 0, 0)):
-        found = triangulate(scene_of(tmp_path / str(step), [pose_at(0.0), pose_at(step)])).points
-        assert least <= len(found) <= most
-
-
 def test_an_unreadable_image_is_named(tmp_path):
     images = scene_of(tmp_path, POSES[:2])
     images.files[1].write_text("not an image")
     with pytest.raises(ValueError, match=r"view1\.png cannot be read"):
         triangulate(images)
-
-
-def test_pairs_are_near_and_look_the_same_way():
-    pairs = near_pairs(np.stack([pose_at(float(i)) for i in range(60)]), NEIGHBOURS)
-    assert all(abs(i - j) <= NEIGHBOURS for i, j in pairs)
-    assert all((i, i + 1) in pairs for i in range(59))
-    around = np.stack([pose_at(0.0, np.radians(45.0 * i)) for i in range(8)])
-    assert near_pairs(around, NEIGHBOURS) == sorted({tuple(sorted((i, (i + 1) % 8))) for i in range(8)})

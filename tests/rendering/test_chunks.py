@@ -39,13 +39,3 @@ def test_a_gpu_renders_what_half_of_its_free_memory_holds(monkeypatch, free, sam
     assert found == GPU_RAYS or found == CPU_RAYS or found <= room < 2 * found
     assert found > CPU_RAYS or room < 2 * CPU_RAYS
     assert found < GPU_RAYS or room >= GPU_RAYS
-
-
-def test_what_torch_holds_unused_counts_as_free(monkeypatch):
-    without = rays_per_chunk(1024, gpu_with(monkeypatch, 1.0))
-    assert rays_per_chunk(1024, gpu_with(monkeypatch, 1.0, cached=3.0)) == 4 * without
-
-
-def test_bounds(monkeypatch):
-    assert rays_per_chunk(1024, gpu_with(monkeypatch, 0.0)) == CPU_RAYS
-    assert rays_per_chunk(0, gpu_with(monkeypatch, 80.0)) == GPU_RAYS

@@ -13,8 +13,6 @@ from random_fields import bundle, compare, fill, random_field, random_rays, rend
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.rendering.rendered import render_rays
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 
@@ -172,21 +170,6 @@ def test_a_ray_is_explained_when_it_enters_before_the_first_content_and_stays_to
     assert not ray_explained(one, [0, 0, -3], [0, 0, 1]), "reaches the first plane far behind the first content"
 
 
-def test_two_mpis_explain_a_ray_together():
-    side = make_mpi("right", (0.0, 0.0, 0.0), ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
-    front = make_mpi()
-    both, alone = (ScenePlan(m, None, 0.05, content_near=2.0) for m in ((front, side), (front,)))
-    start, direction = [0, 0, 1.5], [1.5, 0, 1]
-    assert ray_explained(both, start, direction) and not ray_explained(alone, start, direction)
-    assert ray_explained(alone, [0, 0, 0], [0, 0, 1]) and ray_explained(both, [0, 0, 0], [0, 0, 1])
-
-
-def test_the_cube_explains_no_ray():
-    cube = CubePlan((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0), (4, 4, 4))
-    plan = ScenePlan((make_mpi(),), cube, 0.05, 1.5)
-    assert not ray_explained(plan, [0, 0, 0], [0, 0, -1])
-
-
 def test_without_other_heads_all_that_a_ray_shows_is_to_be_explained():
     one = ScenePlan((make_mpi(near=1.0, extent=(-1.0, 1.0, -0.5, 0.5)),), None, 0.05, content_near=1.5)
     partly = [0, 0, 1.5], [1.3, 0, 1]
@@ -210,22 +193,3 @@ def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
     assert count < 0.8 * (sum(looked_up) - count), "nothing was stopped"
     assert (stopped.rgb - whole.rgb).abs().max() < 1e-4
     assert (stopped.composite.accumulation - whole.composite.accumulation).abs().max() < 1e-4
-
-
-def test_ray_samples_hold_what_the_field_needs():
-    field = random_field(4, True, seed=18)
-    found = render(field, bundle(*random_rays(field.plan, 9, seed=19)), blends=True).samples
-    valid, inverse_t = found.valid, found.inverse_t
-    rays, width = valid.shape
-    assert rays == 9 and width == valid.sum(1).max() and found.ndc.shape == (9, width, 3)
-    for name in ("heads", "planes", "inverse_t", "skipped_before", "tau"):
-        assert getattr(found, name).shape == valid.shape
-    assert valid.dtype == torch.bool and (valid[:, :-1] | ~valid[:, 1:]).all(), "samples are packed to the left"
-    assert (inverse_t[:, :-1] >= inverse_t[:, 1:]).all() and (inverse_t[~valid] == 0).all()
-    assert (found.ndc[valid].abs() <= 1 + 1e-5).all()
-
-
-def test_the_sampler_builds_no_graph():
-    field = random_field(2, True, seed=20).train()
-    samples = render_rays(bundle(*random_rays(field.plan, 4, seed=21)), field, MarchOptions(0.0, blends=True)).samples
-    assert not any(t.requires_grad for t in vars(samples).values() if isinstance(t, torch.Tensor))

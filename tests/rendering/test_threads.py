@@ -10,7 +10,6 @@ from threading import Thread
 
 import pytest
 import torch
-from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from training_runs import differences, ready, trainer_config, write_windows
 
 from mmpi_ns.field.tables import in_half_precision
@@ -84,36 +83,3 @@ def test_three_threads_render_while_checkpoints_are_saved(run, model, tmp_path):
         thread.join()
     assert wrong == [] and saved > 1
     assert differences(dict(model.state_dict()), trained) == []
-
-
-class Interrupt:
-    """Raises before the n-th line of ours that runs, as the viewer does when somebody moves the camera."""
-
-    def __init__(self, number: int) -> None:
-        self.left, self.line = number, None
-
-    def __call__(self, frame, event, arg):
-        if event == "line" and "mmpi_ns" in frame.f_code.co_filename:
-            self.left -= 1
-            if self.left == 0:
-                self.line = f"{frame.f_code.co_filename}:{frame.f_lineno}"
-                raise IOChangeException
-        return self
-
-
-def interrupted(model, camera, number) -> str | None:
-    """Renders in a thread until the n-th line; where that was, None where rendering ended before."""
-    trace = Interrupt(number)
-
-    def render() -> None:
-        try:
-            with torch.no_grad(), SetTrace(trace):
-                model.get_outputs_for_camera(camera)
-        except IOChangeException:
-            pass
-
-    thread = Thread(target=render)
-    thread.start()
-    thread.join(60)
-    assert not thread.is_alive(), "it waits for a lock that nobody gives back"
-    return trace.line

@@ -10,15 +10,14 @@ from bricked import SHAPES, big_plan, bricked_field, chance, layout_of, thinned
 from random_fields import bundle, compare, random_rays, render, sampled
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.tables import ENOUGH_CROSSINGS, RELEASED_DENSITY, TABLES
+from mmpi_ns.field.tables import RELEASED_DENSITY, TABLES
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.interpolate import interpolate_densely, texel_rows
+from mmpi_ns.ops.interpolate import interpolate_densely
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.scene.bricks import (
     grown_tiles,
     new_table,
     resample,
-    write_planes,
 )
 from mmpi_ns.scene.texels import BRICK, make_grids, number_tiles
 from mmpi_ns.training.touched_adam import TouchedAdam
@@ -43,61 +42,6 @@ def test_lookups_read_what_dense_tables_would_give():
         assert np.array_equal(table[grid.nearest(ndc)], block[z, y, x])
 
 
-def test_the_compiled_lookup_reads_the_same_rows_with_the_same_weights(monkeypatch):
-    grids, _, _ = thinned(SHAPES)
-    ndc = torch.tensor(np.random.default_rng(1).uniform(-1.1, 1.1, size=(500, 3)), dtype=torch.float32)
-    ndc[:9] = torch.tensor([-1.0, 0.0, 1.0])[torch.arange(9) % 3, None]
-    monkeypatch.setattr(dispatch, "_chosen", "native")
-    layout = layout_of(SHAPES, grids[0].tiles)
-    for k, grid in enumerate(grids):
-        planes = torch.arange(500) % grid.depth
-        found = texel_rows(layout, torch.full_like(planes, k), planes, ndc)
-        for fast, plain in zip(found, grid.bilinear(planes, ndc), strict=True):
-            assert torch.equal(fast, plain)
-
-
-def test_rows_and_texels_are_each_others_way_back():
-    grids, table, _ = thinned(SHAPES)
-    held = torch.zeros(len(table), dtype=torch.bool)
-    for grid in grids:
-        z, y, x = torch.meshgrid(*(torch.arange(n) for n in (grid.depth, grid.height, grid.width)), indexing="ij")
-        rows = grid.row(z, y, x)
-        stored = rows >= BRICK
-        assert torch.equal(rows.reshape(-1), grid.rows) and torch.equal(grid.holds(rows), stored)
-        for a, b in zip(grid.texel(rows[stored]), (z, y, x), strict=True):
-            assert torch.equal(a, b[stored])
-        assert not held[rows[stored]].any() and len(rows[stored].unique()) == stored.sum()
-        held[rows[stored]] = True
-    assert not held[:BRICK].any() and not any(grid.holds(torch.arange(BRICK)).any() for grid in grids)
-
-
-def test_neighbours_are_the_stored_texels_beside_a_texel():
-    grids, _, _ = thinned(SHAPES)
-    for grid in grids:
-        z, y, x = torch.meshgrid(*(torch.arange(n) for n in (grid.depth, grid.height, grid.width)), indexing="ij")
-        block = grid.row(z, y, x).numpy()
-        padded = np.pad(block, 1)
-        rows = grid.rows[grid.rows >= BRICK]
-        found, exists = grid.neighbours(rows)
-        for row, near, there in zip(rows.tolist(), found.tolist(), exists.tolist(), strict=True):
-            k, j, i = (int(a[0]) + 1 for a in np.nonzero(block == row))
-            wanted = [padded[k, j, i - 1], padded[k, j, i + 1], padded[k, j - 1, i], padded[k, j + 1, i],
-                      padded[k - 1, j, i], padded[k + 1, j, i]]  # fmt: skip
-            assert near == [w if w >= BRICK else row for w in wanted]
-            assert there == [float(w >= BRICK) for w in wanted]
-
-
-def test_planes_are_written_as_images():
-    grids, table, blocks = thinned(SHAPES)
-    copy = table.clone()
-    for grid, block in zip(grids, blocks, strict=True):
-        for planes in (slice(None), slice(grid.depth - 1, grid.depth)):
-            write_planes(copy, grid, planes, torch.tensor(-block[planes]))
-        stored = grid.rows[grid.rows >= BRICK]
-        assert torch.equal(copy[stored], -table[stored])
-    assert torch.equal(copy[:BRICK], table[:BRICK]), "images of tiles that hold nothing go nowhere"
-
-
 # Rays ----------------------------------------------------------------------------------------------------------------
 
 
@@ -107,31 +51,6 @@ def test_rays_through_released_bricks_look_as_the_oracle_says(monkeypatch, route
     monkeypatch.setattr(dispatch, "_chosen", route)
     field = bricked_field()
     assert compare(field, *random_rays(field.plan, 12, seed=5), blends) >= 8
-
-
-@pytest.mark.parametrize("blends", [True, False])
-def test_the_march_leaves_out_what_holds_nothing_and_keeps_the_rest(monkeypatch, blends):
-    field, rays = bricked_field(0.4), None
-    rays = bundle(*random_rays(field.plan, 200, seed=1))
-    found = []
-    for route in ("native", "torch"):
-        monkeypatch.setattr(dispatch, "_chosen", route)
-        found.append(render(field, rays, 1e-3, blends))
-    fast, plain = found
-    same = fast.samples.valid.sum(1) == plain.samples.valid.sum(1)
-    assert same.float().mean() > 0.97
-    assert (fast.rgb - plain.rgb).abs()[same].max() < 3e-5
-    assert (fast.composite.transmittance - plain.composite.transmittance).abs().max() < 1.2e-5
-    assert torch.equal(fast.samples.live, plain.samples.live)
-
-
-def test_colours_without_gradients_equal_those_with():
-    field = bricked_field().eval()
-    samples = sampled(field, bundle(*random_rays(field.plan, 60, seed=8)))
-    with torch.no_grad():
-        fast = field.sample_colors(*samples)
-    plain = field.sample_colors(*samples, field.optical_depths(*samples)[1])
-    assert plain.std() > 0.05 and (fast - plain).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("order", ["rising", "anyhow"])
@@ -283,15 +202,6 @@ def test_a_release_changes_images_by_no_more_than_what_it_gives_up():
     assert (change <= 2 * given_up + 1e-5).all() and change.max() > 1e-4
     heavy = before.composite.weights >= least
     assert (after.composite.weights[heavy] >= before.composite.weights[heavy] - 1e-5).all()
-
-
-def test_nothing_is_given_up_before_enough_rays_were_seen():
-    field = bricked_field()
-    few = bundle(*random_rays(field.plan, 5, seed=3))
-    _, kept = used(field, few, least=0.5)
-    assert kept is None and float(field.crossings) == 0 and not field.peak.any(), "the next look starts afresh"
-    field.crossings.fill_(ENOUGH_CROSSINGS * field.num_bricks)
-    assert field.release_unused(0.5) is not None and field.num_bricks == 0
 
 
 def test_moments_and_marks_follow_their_texels():

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 
-import oracle
 import pytest
 import torch
-from hand_made import directions, numbers, range_of, rays, vectors
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hand_made import rays
 
 from mmpi_ns.scene.geometry import Cube, cube_hits
 from mmpi_ns.scene.plan import CubePlan
 
 F64 = torch.float64
-BORDER = 1e-12
 
 BOX = CubePlan((-1.0, -2.0, -1.0), (1.0, 2.0, 3.0), (9, 9, 5))
 
@@ -45,16 +41,3 @@ def test_cube_step_is_the_shortest_voxel_side_over_the_samples_per_voxel():
 def test_cube_hits_of_hand_made_rays(origin, direction, near, far, expected):
     first, count = cube_hits(*rays(origin, direction, near, far), Cube.pack(BOX, 1.0, dtype=F64))
     assert [int(first) + i for i in range(int(count))] == expected
-
-
-@settings(max_examples=150)
-@given(origin=vectors(3, 8.0), direction=directions(), near=st.just(0.0) | numbers(0, 5), data=st.data())
-def test_cube_hits_equal_testing_every_sample(origin, direction, near, data):
-    far = data.draw(range_of(near))
-    if data.draw(st.booleans()):
-        origin = data.draw(vectors(3, 1.0)) - 3 * direction
-    cube = Cube.pack(BOX, 1.5, dtype=F64)
-    first, count = cube_hits(*rays(origin, direction, near, far), cube)
-    expected, margin = oracle.cube_samples(BOX, cube.step, origin, direction, near, far)
-    if margin > BORDER:
-        assert [int(first) + i for i in range(int(count))] == expected

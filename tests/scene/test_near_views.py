@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from mmpi_ns.scene.near_views import nearest_views
 
@@ -31,13 +30,3 @@ def test_views_that_face_elsewhere_or_stand_in_the_same_place_are_left_out():
     assert nearest_views(far, 0, 9) == [3, 1, 2, 4]
     together = poses_of([0, 0, 0], [0] * 3)
     assert nearest_views(together, 0, 9) == [] and nearest_views(together, 1, 9, apart=False) == [0, 2]
-
-
-@pytest.mark.parametrize("among", [[4, 1], np.array([1, 4, 0]), []])
-def test_some_views_alone(among):
-    poses = poses_of([0, 1, 2, 3, 0.5], [0] * 5)
-    assert nearest_views(poses, 0, 9, 60.0, among) == ([4, 1] if len(among) else [])
-
-
-def test_equal_distances_keep_their_order():
-    assert nearest_views(poses_of([0, 1, -1, 1], [0] * 4), 0, 2) == [1, 2]

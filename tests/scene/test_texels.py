@@ -9,7 +9,7 @@ import torch
 
 from mmpi_ns.ops.interpolate import interpolate_densely
 from mmpi_ns.scene.bricks import resample
-from mmpi_ns.scene.texels import BRICK, head_grids, make_grids
+from mmpi_ns.scene.texels import BRICK, head_grids
 
 F64 = torch.float64
 
@@ -58,47 +58,6 @@ def test_trilinear_lookup_equals_the_loop_in_every_head(plan, table):
         for i in range(90):
             wanted = oracle.trilinear(block(table, grid), ndc[i].tolist())
             assert np.allclose(found[i], wanted, rtol=1e-12, atol=1e-12)
-
-
-def test_corners_of_the_frustum_are_texel_centres(plan, table):
-    grid = head_grids(plan)[1]
-    values = block(table, grid)
-    corners = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]], dtype=F64)
-    found = interpolate_densely(table, *grid.bilinear(torch.full((4,), 8), corners))
-    wanted = [values[8, 0, 0], values[8, 0, -1], values[8, -1, 0], values[8, -1, -1]]
-    assert np.array_equal(found, np.array(wanted))
-
-
-def test_trilinear_on_a_plane_equals_bilinear_on_that_plane(plan, table):
-    """Near plane s = -1, plane at infinity s = +1, even spacing between: the order in which planes are stored."""
-    grid, uv = head_grids(plan)[0], positions(45, 2)
-    for plane in range(9):
-        s = torch.full((45, 1), 2 * plane / 8 - 1, dtype=F64)
-        flat = interpolate_densely(table, *grid.bilinear(torch.full((45,), plane), uv))
-        assert torch.allclose(flat, interpolate_densely(table, *grid.trilinear(torch.cat([uv, s], -1))))
-
-
-def test_lookups_stay_in_their_own_block_and_weights_sum_to_one(plan):
-    ndc = torch.cat([positions(200, 3), torch.full((1, 3), 1e30), torch.full((1, 3), -1e30)])
-    for grid in head_grids(plan):
-        lookups = [grid.trilinear(ndc), (grid.nearest(ndc)[:, None], torch.ones(202, 1))]
-        lookups += [grid.bilinear(torch.tensor(p).expand(202), ndc[:, :2]) for p in (0, grid.depth - 1)]
-        for rows, weights in lookups:
-            assert torch.isin(rows, grid.rows).all() and grid.holds(rows.reshape(-1)).all()
-            assert torch.allclose(weights.double().sum(-1), torch.ones(202, dtype=F64)) and (weights >= 0).all()
-
-
-@pytest.mark.parametrize("size", [270, 4096])
-def test_float32_lookups_are_off_by_a_small_share_of_a_texel(size):
-    (grid,) = make_grids([(2, size, size)])
-    uv = positions(2000, 2).clamp(-1, 1)
-    for i, dtype in ((0, F64), (1, torch.float32)):
-        rows, weights = grid.bilinear(torch.zeros(2000, dtype=torch.int64), uv.to(dtype))
-        column = (grid.texel(rows)[2] * weights.double()).sum(-1)
-        if i == 0:
-            exact = column
-    # A coordinate in [-1, 1] rounds to 6e-8, which is size / 2 times that in texels.
-    assert (column - exact).abs().max() < 2.0e-7 * size
 
 
 def test_nearest_texel_is_the_one_with_the_largest_weight(plan):
@@ -151,9 +110,3 @@ def test_resampling_keeps_planes_apart_and_corners_exact(plan, table):
     lonely[old[0].rows[4 * 35 : 5 * 35]] = 1
     spread = block(resample(lonely, old, new), new[0])
     assert (spread[4] == 1).all() and spread.sum() == spread[4].size
-
-
-def test_resampling_to_the_same_size_changes_nothing(plan, table):
-    grids = head_grids(plan)
-    found = resample(table, grids, grids)
-    assert all(torch.equal(found[g.rows], table[g.rows]) for g in grids)

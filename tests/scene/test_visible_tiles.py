@@ -7,11 +7,7 @@ import pytest
 import torch
 from hand_made import make_mpi, rotation
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from training_runs import datamanager, plan_of
 
-from mmpi_ns.data.datamanager import CAPTURE
-from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.scene import visible_tiles
 from mmpi_ns.scene.geometry import Frames, plane_hits, sample_disparity
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK, head_grids
@@ -110,49 +106,9 @@ def test_planes_that_every_camera_has_passed_are_out_of_reach():
     assert (depths < 2).any() and torch.equal(ahead, depths > 2)
 
 
-@pytest.mark.parametrize("count", [1, 7, 30])
-def test_tiles_of_all_images_are_those_of_each_alone_and_found_once(monkeypatch, count):
-    """Also behind, before and among the planes; on whatever device, and for equal cameras in other arrays."""
-    views, plan, looks = TrainingViews.of(cameras(5, count, turn=0.8)), plan_around(1), []
-    tiles_of = visible_tiles._tiles_of
-    monkeypatch.setattr(visible_tiles, "_tiles_of", lambda *given: looks.append(given) or tiles_of(*given))
-    visible_tiles._remembered.clear()
-    whole = reachable_tiles(views, plan)
-    alone = [reachable_tiles(TrainingViews(*(x[i : i + 1] for x in vars(views).values())), plan) for i in range(count)]
-    assert torch.equal(whole, torch.stack(alone).any(0)) and not whole.all()
-    before = len(looks)
-    again = reachable_tiles(TrainingViews(*(x.clone() for x in vars(views).values())), plan, "cuda")
-    assert torch.equal(again, whole) and len(looks) == before
-    again[:] = True
-    assert torch.equal(reachable_tiles(views, plan), whole), "nobody writes into what is remembered"
-
-
-def test_an_mpi_that_faces_away_stores_nothing():
-    away = make_mpi(axes=((-1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0)), height=20, width=20)
-    views = TrainingViews.of(cameras(0, turn=0.05))
-    plan = ScenePlan((make_mpi(height=20, width=20), away), None, 0.05, 1.0)
-    found = reachable_tiles(views, plan).view(2, -1)
-    assert found[0].any() and not found[1].any()
-    field = MMPIField(plan)
-    assert field.num_bricks == 2 * 9 * 9
-    field.views = views
-    field.build(plan, 1.0)
-    assert field.num_bricks == found.sum() and (field.grids[1].rows < BRICK).all()
-
-
 @pytest.mark.parametrize("kind", [CameraType.EQUIRECTANGULAR, CameraType.FISHEYE])
 def test_a_camera_that_sees_half_the_world_reaches_every_plane_before_it(kind):
     views, plan = TrainingViews.of(cameras(0, kind=kind, focal=15.0)), plan_around(0)  # 2.1 radians to each side
     assert not views.inward.any()
     shares = reachable_tiles(views, plan)[: 8 * 12 * 17].view(8, -1).float().mean(1).tolist()
     assert set(shares) <= {0.0, 1.0} and shares[-1] == 1
-
-
-def test_the_data_manager_hands_the_training_images_to_the_model(scene):
-    manager = datamanager(scene)
-    views = manager.train_dataset.metadata[CAPTURE].views
-    plan = plan_of(manager.observations)
-    assert len(views.origins) == len(manager.train_dataset)
-    bundle = manager.next_train(0)[0]  # pixels and keypoints
-    wanted = read_tiles(bundle, plan)
-    assert wanted.any() and (reachable_tiles(views, plan) | ~wanted).all()

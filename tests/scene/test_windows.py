@@ -15,7 +15,7 @@ from training_runs import datamanager, schedule_of
 
 from mmpi_ns.placement.defaults import FEW, MANY, RAYS, rays_times, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
-from mmpi_ns.placement.split import FEWEST, find_balls, most_pixels, of_cameras, place_windows
+from mmpi_ns.placement.split import find_balls, most_pixels, of_cameras, place_windows
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
@@ -76,14 +76,6 @@ def test_windows_do_not_depend_on_the_order_of_the_cameras():
     for (a, ra, ma), (b, rb, mb) in zip(find_balls(seen, 4.0), find_balls(shuffled, 4.0), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
         np.testing.assert_allclose([ra, ma], [rb, mb], rtol=1e-2)
-
-
-def test_no_window_has_too_few_cameras():
-    seen = road(120)
-    lone = of_cameras(seen, np.array([*range(60), 118, 119]))
-    centers = lone.centers
-    for center, radius, _ in find_balls(lone, 3.0):
-        assert (np.linalg.norm(centers - center, axis=-1) <= radius + 1e-9).sum() >= FEWEST
 
 
 def test_some_cameras_observations_are_those_of_the_whole():
@@ -181,22 +173,3 @@ def test_a_capture_too_large_for_memory_is_read_window_by_window_with_the_same_d
         assert torch.equal(a["image"], b["image"]) and torch.equal(a["indices"], b["indices"])
         assert torch.equal(ours.directions, theirs.directions)
         assert set(a["indices"][:, 0].tolist()) <= {1, 2, 5}
-
-
-def test_without_windows_a_large_capture_is_read_when_it_is_first_drawn_from(scene):
-    at_once, late = (datamanager(scene, resident_pixels=limit) for limit in (60e6, 0))
-    assert torch.equal(at_once.next_train(0)[1]["image"], late.next_train(0)[1]["image"])
-
-
-def test_evaluation_batches_are_pixels_of_one_image_drawn_by_the_step(scene):
-    manager = datamanager(scene)
-    bundle, batch = manager.next_eval(3)
-    torch.rand(3)
-    again, same_batch = datamanager(scene).next_eval(3)
-    assert torch.equal(same_batch["indices"], batch["indices"]) and torch.equal(again.directions, bundle.directions)
-    assert len(bundle) == len(batch["image"]) == manager.config.eval_num_rays_per_batch
-    assert len(set(batch["indices"][:, 0].tolist())) == 1
-    assert {int(manager.next_eval(s)[0].camera_indices[0]) for s in range(20)} == {0, 1}
-    image = manager.eval_dataset[int(batch["indices"][0, 0])]["image"]
-    expected = image[batch["indices"][:, 1], batch["indices"][:, 2]]
-    assert torch.equal(batch["image"], expected)

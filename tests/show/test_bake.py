@@ -7,24 +7,18 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
-from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.shading import RayShader
-from mmpi_ns.rendering.metrics import psnr
 from mmpi_ns.rendering.rendered import bounded, shown_outputs, winners
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_show import __main__ as export
-from mmpi_show import bake as bake_module
-from mmpi_show import windows as baking
 from mmpi_show.bake import bake_of_model, bake_run, compare
 from mmpi_show.files import read_baked, write_baked
-from mmpi_show.scene import brick_numbers
 
 
 @pytest.fixture(scope="module")
@@ -138,95 +132,6 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
     assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
 
 
-def test_torch_takes_one_thread_while_a_run_is_baked(trainer, monkeypatch, three_threads):
-    filled(trainer)
-    threads, rays = [], bake_module.image_rays
-    monkeypatch.setattr(bake_module, "image_rays", lambda *v: threads.append(torch.get_num_threads()) or rays(*v))
-    bake_run(trainer.pipeline, 0)
-    assert threads and set(threads) == {1} and torch.get_num_threads() == 3
-
-
-def test_cameras_that_train_and_are_scored_are_training_cameras(trainer, monkeypatch):
-    """As in a capture of fewer than ten images without lists; splats are fitted to training cameras."""
-    filled(trainer)
-    manager = trainer.pipeline.datamanager
-    monkeypatch.setattr(manager, "eval_dataset", manager.train_dataset)
-    path = bake_run(trainer.pipeline, 0).path
-    assert len(path) == len(manager.train_dataset) and not any(pose.test for pose in path)
-
-
-def test_see_through_test_images_are_compared_over_the_background(trainer, monkeypatch):
-    model = filled(trainer)
-    scene, dataset = bake_run(trainer.pipeline, 0), trainer.pipeline.datamanager.eval_dataset
-    shown = model.get_outputs_for_camera_ray_bundle(image_rays(dataset.cameras[:1]))["rgb"]
-    background = float(model.observed({"image": torch.zeros(1, 1, 4)}).mean())
-    hidden = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(*shown.shape[:2], 4)  # red, all see-through
-    monkeypatch.setattr(dataset, "get_data", lambda *_, **__: {"image": hidden})
-    expected = psnr(torch.full_like(shown, background), shown)
-    assert compare(trainer.pipeline, scene, 1)["exact"]["psnr"] == pytest.approx(expected, abs=1e-3)
-
-
-def test_codes_are_off_where_training_views_see_little_of_them(trainer, monkeypatch):
-    filled(trainer)
-    smooth, seen = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis, []
-    monkeypatch.setattr(bake_module, "smoothed", lambda window, peaks: seen.append(peaks) or window)
-    exact = bake_run(trainer.pipeline, 0.003).windows[0][1].mpis
-    for i, codes in enumerate(exact.channel_codes):
-        off = codes.step * (smooth.texels[..., i].int() - exact.texels[..., i].int()).abs()
-        assert (off * seen[0] <= bake_module.SLACK + 1e-6).all() and off.max() > 1
-    assert torch.equal(smooth.density, exact.density)
-
-
-def test_the_weights_of_an_image_are_looked_at_in_parts(trainer, monkeypatch):
-    """A photo of 12 megapixels at once would take gigabytes."""
-    window = bake_of_model(filled(trainer), trainer.pipeline.model.field)
-    rays = bundle_of(trainer.pipeline.model.field.plan)
-    largest: list[int] = []
-    shown = baking.show_baked
-
-    def counted(mpis, rays, *arguments):
-        largest.append(len(rays.origins))
-        return shown(mpis, rays, *arguments)
-
-    whole = window.peaks([(rays.origins, rays.directions)])
-    monkeypatch.setattr(baking, "AT_ONCE", 37)
-    monkeypatch.setattr(baking, "show_baked", counted)
-    assert torch.equal(window.peaks([(rays.origins, rays.directions)]), whole)
-    assert whole.max() > 0.01 and max(largest) == 37 and sum(largest) == len(rays)
-
-
-def test_of_many_pixels_every_nth_row_and_column_decides_which_bricks_are_seen(trainer, monkeypatch):
-    filled(trainer)
-    cameras = trainer.pipeline.datamanager.train_dataset.cameras
-    total, looked_at = int((cameras.width * cameras.height).sum()), []
-    peaks = baking.BakedWindow.peaks
-
-    def counted(window, views):
-        views = list(views)
-        looked_at.append(sum(len(origins) for origins, _ in views))
-        return peaks(window, views)
-
-    monkeypatch.setattr(baking.BakedWindow, "peaks", counted)
-    bricks = []
-    for most in (total, total / 4):
-        monkeypatch.setattr(bake_module, "MOST_LOOKED_AT", most)
-        bricks.append(bake_run(trainer.pipeline, 0.003).windows[0][1].mpis.num_bricks)
-    assert looked_at == [total, total // 4]
-    assert 0.8 * bricks[0] < bricks[1] <= bricks[0]
-
-
-def test_lenses_are_undistorted_once(trainer, monkeypatch):
-    """nerfstudio undistorts an image three times over, all of it at once."""
-    filled(trainer)
-    manager = trainer.pipeline.datamanager
-    for dataset in (manager.train_dataset, manager.eval_dataset):
-        lens = torch.tensor([0.05, -0.02, 0.0, 0.0, 0.003, -0.002]).repeat(len(dataset.cameras), 1)
-        monkeypatch.setattr(dataset.cameras, "distortion_params", lens)
-    monkeypatch.setattr(type(manager.eval_dataset.cameras), "generate_rays", None)
-    scene = bake_run(trainer.pipeline, 0.003)
-    assert compare(trainer.pipeline, scene, 2)["baked"]["to_exact"] > 35
-
-
 def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
     model = filled(trainer)
     monkeypatch.setattr(model.field, "feature_channels", 17)
@@ -276,35 +181,3 @@ def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch, caps
     said = capsys.readouterr().err.strip()
     assert caught.value.code == 1 and said.startswith("mmpi-export: ") and words in said and "\n" not in said
     assert all(Path(name).read_text() == "{}" for name in files)
-
-
-def test_baked_codes_are_those_of_the_planes(trainer, monkeypatch, request):
-    """Bricks hold the codes of the whole planes, read texel by texel, and no tile with a code above 0 is missing."""
-    field, g = filled(trainer, 4).field, torch.Generator().manual_seed(2)
-    plan, factor = field.full_plan, field.factor
-    field.copy_finely((field.tiles > 0) & (torch.rand(len(field.tiles), generator=g) < 0.4))
-    request.addfinalizer(lambda: field.build(plan, factor))
-    field._keep(torch.rand(field.num_bricks + 1, generator=g) < 0.6)
-    field.density.data[64:][torch.rand(len(field.density) - 64, generator=g) < 0.3] = -20.0
-    monkeypatch.setattr(baking, "AT_ONCE_BRICKS", 7)
-    baked, seen = baking.bake(field, 3e-3, 0.5, False, (1.0, 1.0, 1.0)).mpis, 0
-    assert (field.tiles == 0).any() and baked.num_bricks > 50
-    for k, numbers in enumerate(brick_numbers(baked.columns, baked.mpis)):
-        grid = field.grids[k]
-        planes = field.density.data[grid.rows, 0].view(grid.depth, grid.height, grid.width)
-        codes = baked.density_codes.encode(planes + field.layout.biases[k][:, None, None])
-        features = field.features.data[grid.rows].view(grid.depth, grid.height, grid.width, -1)
-        stored = (grid.rows >= 64).view(grid.depth, grid.height, grid.width)
-        for (plane, row, column), number in zip(np.ndindex(numbers.shape), numbers.flatten().tolist(), strict=True):
-            place = plane, slice(7 * row, 7 * row + 8), slice(7 * column, 7 * column + 8)
-            shows = bool(stored[place].any()) and bool((codes[place] > 0).any())
-            assert (number >= 0) == shows
-            if number < 0:
-                continue
-            height, width = codes[place].shape
-            assert torch.equal(baked.density[number, :height, :width], codes[place])
-            for i, channel in enumerate(baked.channel_codes):
-                assert torch.equal(baked.texels[number, :height, :width, i], channel.encode(features[place][..., i]))
-            assert not baked.density[number, height:].any() and not baked.texels[number, :, width:].any()
-            seen += 1
-    assert seen == baked.num_bricks

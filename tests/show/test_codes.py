@@ -8,12 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from random_bricks import random_window, scene_of
+from random_bricks import random_window
 
-from mmpi_show.bake import smoothed
-from mmpi_show.codes import coarse_differences, smoothed_codes
-from mmpi_show.files import write_baked
-from mmpi_show.ops.baked import reader
+from mmpi_show.codes import smoothed_codes
 from mmpi_show.scene import CELLS, brick_numbers, most_of_copies, neighbours, take_borders
 
 
@@ -60,17 +57,6 @@ def test_a_code_is_exact_or_expected_and_within_its_slack():
     assert torch.equal(smoothed_codes(codes, torch.zeros_like(slack), beside), codes)
 
 
-def test_nothing_is_stored_of_codes_that_nothing_sees(tmp_path):
-    """All differences of colours and features in the file are 0 but those of the first texels of bricks."""
-    window, _, _ = rough_window()
-    write_baked(scene_of(smoothed(window, torch.zeros(window.mpis.density.shape))), tmp_path)
-    row = reader.read(tmp_path)["windows"][0]
-    assert not row["fine_array"][1:].any()
-    assert not row["late_array"][1:, 1:].any() and not row["early_array"][1:, 1:].any()
-    texels = row["texels_array"].reshape(-1, 8, 8, len(row["channels"]))[:, :7, :7]  # the borders are the neighbours'
-    assert np.ptp(texels, axis=(1, 2)).max() == 0 and np.ptp(texels) > 0
-
-
 @pytest.mark.parametrize("stored", [0.3, 0.7, 1.0])
 def test_copies_of_a_texel_have_the_largest_value_of_them(stored):
     """By the place of each texel in its plane; bricks that touch at a corner alone keep a value each."""
@@ -90,8 +76,3 @@ def test_copies_of_a_texel_have_the_largest_value_of_them(stored):
     agreeing = most.clone()
     take_borders(agreeing, beside)
     assert torch.equal(agreeing, most)
-
-
-def test_a_first_part_without_a_brick_is_empty():
-    """A window of a few bricks has no room for one in its first tenth."""
-    assert coarse_differences(np.zeros((9, 0, 4, 4), np.uint8)).shape == (9, 16, 0)

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from random_bricks import random_window, rays_into, scene_of
 
-from mmpi_ns.ops.march import Rays
-from mmpi_show import files
 from mmpi_show.details import StoredView
 from mmpi_show.files import HEADER, read_baked, write_baked
-from mmpi_show.ops.baked import reader, show_baked
 
 
 @pytest.fixture
@@ -45,20 +40,6 @@ def test_what_is_written_is_read(folder):
                 assert torch.equal(a.half().float(), b)
 
 
-def test_an_unbounded_window_stays_unbounded(tmp_path):
-    write_baked(scene_of(random_window()), tmp_path)
-    assert read_baked(tmp_path).windows[0][0].radius == float("inf")
-    assert json.loads((tmp_path / HEADER).read_text())["windows"][0]["radius"] is None
-
-
-def test_the_reader_finds_the_same_codes(folder):
-    raw, scene = reader.read(folder), read_baked(folder)
-    for row, (_, window) in zip(raw["windows"], scene.windows, strict=True):
-        assert np.array_equal(row["density_array"], window.mpis.density.numpy().reshape(-1, 64))
-        texels = window.mpis.texels.numpy().reshape(-1, 64, len(row["channels"]))
-        assert np.array_equal(row["texels_array"], texels)
-
-
 def test_windows_are_mixed_by_their_shares():
     """Midway between two windows a ray shows the mean of both, and inside a ball one alone."""
     a, b = random_window(seed=3, stored=1.0), random_window(seed=4, stored=1.0)
@@ -70,15 +51,6 @@ def test_windows_are_mixed_by_their_shares():
     torch.testing.assert_close(shown, (parts[0] + parts[1]) / 2, atol=1e-5, rtol=0)
     at_first = scene.render(origins - 2, directions)["rgb"]
     torch.testing.assert_close(at_first, a.render(origins - 2, directions)["rgb"])
-
-
-@pytest.mark.parametrize("size", [0, 1, 999, 30_500])
-def test_arrays_of_any_length_are_packed(size):
-    """Runs take few bytes, and the same array the same ones each time."""
-    data = (np.arange(size) // 37 % 50).astype(np.uint8)
-    packed = files._gzip(data)
-    assert gzip.decompress(packed) == data.tobytes() and len(packed) < 100 + size / 2
-    assert files._gzip(data.copy()) == packed
 
 
 def edit(folder, **changes):
@@ -115,34 +87,6 @@ def test_damage_is_one_sentence(folder):
     refused("damaged")
     (folder / HEADER).unlink()
     refused("no baked scene", "mmpi-export bake")
-
-
-def test_a_full_disk_leaves_no_header(folder, monkeypatch):
-    """Writing over an export that fails half way leaves nothing that looks whole."""
-    import mmpi_show.files as files
-
-    monkeypatch.setattr(files, "write_atomically", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        write_baked(scene_of(random_window()), folder)
-    assert not (folder / HEADER).is_file()
-
-
-def full_disk(path, write, folder=None):
-    raise OSError(28, "No space left on device", str(path))
-
-
-def test_arrays_are_plain_gzip(folder):
-    """Any gzip reads an array at its offset."""
-    row = json.loads((folder / HEADER).read_text())["windows"][0]
-    spec = row["arrays"]["columns"]
-    data = (folder / row["file"]).read_bytes()[spec["offset"] : spec["offset"] + spec["bytes"]]
-    assert len(gzip.decompress(data)) == 4 * int(np.prod(spec["shape"]))
-
-
-def test_the_reference_takes_any_window(folder):
-    """A scene that was read renders as it stands (also by the form without a compiler)."""
-    window = read_baked(folder).windows[1][1]
-    assert (show_baked.reference(window.mpis, Rays(*rays_into(window, 30)), window.threshold).mass > 0).any()
 
 
 def test_what_comes_first_takes_a_tenth_of_the_bytes(tmp_path):

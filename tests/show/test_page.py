@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import shutil
 import time
@@ -85,20 +84,6 @@ def test_the_canvas_shows_what_we_render(opened, site):
         assert psnr(a, b) > CLOSE, (number, psnr(a, b))
 
 
-def test_windows_are_mixed(opened, site):
-    """Between two windows the page fetches both and mixes them as we do."""
-    scene = read_baked(site)
-    middle = np.add(scene.windows[0][0].center, (2.0, 0.0, 0.0))
-    opened.evaluate(f"mmpi.path[0].eye = {middle.tolist()}; mmpi.camera = structuredClone(mmpi.path[0]); mmpi.feed()")
-    opened.until("mmpi.windows.get(0)?.whole && mmpi.windows.get(1)?.whole")
-    pose = scene.path[0]
-    for row, value in zip(pose.to_world, middle, strict=True):
-        row[3] = float(value)
-    close = psnr(shown(opened, 0), ours(site, pose))
-    opened.evaluate("mmpi.press('r')")
-    assert close > CLOSE - 4  # each window's part is rounded to 8 bits
-
-
 def until(happened, wait=30):
     """Waits for what an event brings about: the page handles it when it comes to it."""
     end = time.monotonic() + wait
@@ -135,16 +120,6 @@ def test_controls_move_the_camera(opened):
     assert np.allclose(eye(opened), before)
 
 
-def test_two_fingers_move_forward(opened):
-    opened.evaluate("mmpi.press('r')")
-    before = eye(opened)
-    points = lambda gap: [{"x": 100 - gap, "y": 80, "id": 0}, {"x": 100 + gap, "y": 80, "id": 1}]  # noqa: E731
-    opened.send("Input.dispatchTouchEvent", type="touchStart", touchPoints=points(10))
-    opened.send("Input.dispatchTouchEvent", type="touchMove", touchPoints=points(40))
-    opened.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-    until(lambda: (eye(opened) - before) @ np.array(opened.evaluate("mmpi.camera.axes[2]")) < 0)
-
-
 def test_keys_choose_what_is_shown(opened):
     """Depth, winning MPI and one MPI alone differ from the colours, and colours come back."""
     colors = shown(opened, 1)
@@ -163,13 +138,6 @@ def test_keys_choose_what_is_shown(opened):
     opened.evaluate("mmpi.press('m')")
     assert opened.evaluate("mmpi.alone") is None
     assert np.array_equal(shown(opened, 1), colors)
-
-
-def test_resolution_follows_the_time_of_a_frame(opened):
-    """A camera that moves is drawn with fewer pixels where a frame costs too much, and sharply again at rest."""
-    opened.evaluate("mmpi.cost = 1e-4; mmpi.touched()")
-    small = opened.until("mmpi.drawn < 1 && mmpi.gl.canvas.width")
-    assert small < opened.evaluate("innerWidth")
 
 
 def test_the_console_stays_empty(opened):
@@ -224,52 +192,6 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
     assert tab.messages == []
 
 
-DECODED = """(async () => {
-    const row = mmpi.header.windows[0], [first, rest] = mmpi.source(row, () => {}), shown = [[], []];
-    const { addAtlas } = WindowOnCard.prototype;
-    const into = (which) => { WindowOnCard.prototype.addAtlas = (codes) => which.push(...codes.map((c) => [...c])); };
-    into(shown[0]);
-    const card = await WindowOnCard.load(mmpi.gl, row, await first, mmpi.details);
-    into(shown[1]);
-    await card.complete(await rest);
-    WindowOnCard.prototype.addAtlas = addAtlas;
-    return shown;
-})()"""
-"""Codes of density and channels that the page decodes, from the first part of a file and from all of it."""
-
-
-def halved(codes):
-    """Codes [B, 8, 8] with all but every second row and column replaced by means, texel by texel."""
-    codes = codes.to(torch.int64)
-    for y, x in [*itertools.product(range(0, 8, 2), range(1, 8, 2)), *itertools.product(range(1, 8, 2), range(8))]:
-        dy, dx = (0, 1) if y % 2 == 0 else (1, 0)
-        after = codes[:, y + dy, x + dx] if max(y + dy, x + dx) < 8 else codes[:, y - dy, x - dx]
-        codes[:, y, x] = (codes[:, y - dy, x - dx] + after) // 2
-    return codes.to(torch.uint8)
-
-
-def test_the_bricks_that_are_seen_most_come_first_at_half_of_their_resolution(tab, tmp_path):
-    """And then all of them, bit for bit; the first part is a small one."""
-    window = random_window(seed=6)
-    seen = torch.rand(window.mpis.num_bricks, generator=torch.Generator().manual_seed(0))
-    write_baked(scene_of(replace(window, seen=seen)), tmp_path)
-    write_page(tmp_path)
-    row = json.loads((tmp_path / HEADER).read_text())["windows"][0]
-    count = row["arrays"]["early"]["shape"][2]
-    assert 0 < count < window.mpis.num_bricks and row["first_bytes"] <= 0.1 * row["bytes"]
-    with served(tmp_path) as address:
-        assert tab.open(f"{address}/index.html") == "ready"
-        tab.until(WHOLE)
-        first, whole = (torch.tensor(x, dtype=torch.uint8) for x in tab.evaluate(DECODED))
-    mpis = window.mpis
-    assert torch.equal(whole, torch.stack([mpis.density, *mpis.texels.unbind(-1)]).flatten(2).flatten(1))
-    kept = window.keep(seen >= seen.sort(descending=True).values[count - 1]).mpis
-    expected = [halved(x) for x in (kept.density, *kept.texels.unbind(-1))]
-    for codes in expected:
-        take_borders(codes, neighbours(kept.columns, kept.mpis, kept.num_bricks))
-    assert torch.equal(first, torch.stack(expected).flatten(2).flatten(1))
-
-
 @pytest.fixture(scope="module")
 def detailed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("detailed")
@@ -303,35 +225,6 @@ def test_details_are_those_of_baked_scenes(tab, detailed):
     assert tab.messages == []
 
 
-def test_the_images_that_a_camera_needs_take_the_place_of_others(tab, tmp_path):
-    """More training images than fit the card: each camera gets its nearest ones, as in baked scenes, less the nearer
-    they are to the next one; and a window that leaves takes its images along."""
-    scene = detailed_scene(tmp_path / "details", nearest=1)
-    views = []
-    for i in range(9):
-        camera = list(scene.views[i % 3].camera)
-        camera[3] += 0.002 * i
-        views.append(replace(scene.views[i % 3], camera=tuple(camera)))
-    write_baked(replace(scene, views=tuple(views)), tmp_path / "site")
-    write_page(tmp_path / "site")
-    with served(tmp_path / "site") as address:
-        assert tab.open(f"{address}/index.html") == "ready"
-        tab.until(f"{WHOLE} && mmpi.details.views.length === 9")
-        details = read_baked(tmp_path / "site").details
-        for i in (0, 5, 8, 2, 7):
-            eye = [x + 1e-4 for x in details.cameras[i, [3, 7, 11]].tolist()]
-            tab.evaluate(f"mmpi.camera.eye = {eye}; mmpi.touched(); mmpi.feed()")
-            tab.until("mmpi.details.ready(mmpi.camera)")
-            kept = tab.evaluate("mmpi.details.layers.filter(Boolean).map((v) => mmpi.details.views.indexOf(v))")
-            assert i in kept and len(kept) <= 3
-            share = tab.evaluate("mmpi.details.chosen(mmpi.camera).map((c) => c.share)")
-            apart = (details.cameras[:, [3, 7, 11]] - torch.tensor(eye)).norm(dim=-1).sort().values
-            assert share == pytest.approx([1 - float(apart[0] / apart[1]) ** 2], abs=1e-3)
-        tab.evaluate("mmpi.details.remove(mmpi.header.windows[0])")
-        assert tab.evaluate("mmpi.details.views.length + mmpi.details.layers.filter(Boolean).length") == 0
-    assert tab.messages == []
-
-
 def test_damaged_details_are_a_sentence_on_the_page(tab, detailed, tmp_path):
     shutil.copytree(detailed, tmp_path / "site")
     header = json.loads((tmp_path / "site" / HEADER).read_text())
@@ -344,13 +237,6 @@ def test_damaged_details_are_a_sentence_on_the_page(tab, detailed, tmp_path):
         tab.open(f"{address}/index.html")
         tab.until("document.body.dataset.state === 'failed'")
         assert "damaged" in tab.evaluate("document.getElementById('status').textContent")
-
-
-def test_one_file_shows_details(tab, detailed, tmp_path):
-    write_page(detailed, tmp_path / "one.html")
-    assert tab.open((tmp_path / "one.html").as_uri()) == "ready"
-    tab.until(f"{WHOLE} && mmpi.details.ready(mmpi.path[0]) && mmpi.details.views.length === 3")
-    assert psnr(shown(tab, 0), detailed_image(detailed, 0)) > 38
 
 
 def test_one_file_opens_from_the_disk(tab, site, tmp_path):
@@ -387,8 +273,3 @@ def test_damage_is_a_sentence_on_the_page(tab, tmp_path):
         assert "missing" in refusal(tab, page)
     header.write_text(text)
     assert "--single-file" in refusal(tab, (tmp_path / "index.html").as_uri())
-
-
-def test_a_browser_without_webgl2_is_told(site, tmp_path):
-    with served(site) as address, browser(tmp_path / "profile", "--disable-3d-apis") as plain:
-        assert "WebGL2" in refusal(plain, f"{address}/index.html")

@@ -89,18 +89,6 @@ def test_neighbours_that_agree_become_one(window):
     assert len(few.means) == 50
 
 
-def test_torch_takes_one_thread_while_splats_are_made(window, monkeypatch, three_threads):
-    threads, texels = [], splats._texels
-    monkeypatch.setattr(splats, "_texels", lambda *v: threads.append(torch.get_num_threads()) or texels(*v))
-    splats.splats_of(window, cameras(window), 0.0, 50, rounds=0)
-    assert threads == [1] and torch.get_num_threads() == 3
-
-
-def test_a_weight_that_no_texel_has_is_refused(window):
-    with pytest.raises(ValueError, match="give a smaller --weight"):
-        splats.splats_of(window, cameras(window), 1.5, 100)
-
-
 def test_fitted_colours_come_closer_to_the_window(window):
     """Each round brings images of the splats closer to those of the bricks, also from between the cameras."""
     poses = cameras(window)
@@ -119,55 +107,6 @@ def test_fitted_colours_come_closer_to_the_window(window):
     assert error(end, small) < 0.01
 
 
-def test_fitted_opacities_help(window, monkeypatch):
-    """Splats that are too faint come closer to the window with their opacities than with their colours alone."""
-    poses = cameras(window)
-    faint = splats.splats_of(window, poses, 0.01, 10_000, rounds=0)
-    faint = replace(faint, alphas=0.4 * faint.alphas)
-
-    def error(step):
-        monkeypatch.setattr(splats, "OPACITY_STEP", step)
-        found = faint
-        for _ in range(4):
-            found = splats.fitted(found, window, poses)
-        shown = [splat_image(found.gaussians, view_of(p), colors_from(found, eye_of(p))) for p in poses]
-        images = [x[..., :3] + window.background * x[..., 3:] for x in shown]
-        targets = [window.render(*p.rays())["rgb"] for p in poses]
-        return sum(float((a.reshape(-1, 3) - b).square().mean()) for a, b in zip(images, targets, strict=True))
-
-    assert error(splats.OPACITY_STEP) < 0.95 * error(0.0)
-
-
-def test_splats_do_not_depend_on_the_number_of_threads(window):
-    """Cameras are shared out; what they add up to is added in their order."""
-    poses = cameras(window)
-    alone = splats.splats_of(window, poses, 0.01, 10**6, rounds=2)
-    torch.set_num_threads(2)
-    try:
-        shared = splats.splats_of(window, poses, 0.01, 10**6, rounds=2)
-    finally:
-        torch.set_num_threads(1)
-    for name in ("means", "scales", "alphas", "colors"):
-        assert torch.equal(getattr(alone, name), getattr(shared, name)), name
-
-
-def view_of(pose):
-    return View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-
-
 def colors_from(made, eye):
     """Colours of all splats, seen from a point."""
     return (made.basis(eye)[:, :, None] * made.colors).sum(1).clamp(0, 1)
-
-
-def eye_of(pose):
-    return torch.tensor(pose.to_world).float()[:, 3]
-
-
-def test_cameras_between_two_lie_between_them():
-    a = Pose([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], (4, 4), (4, 4), (2, 2))
-    b = replace(a, to_world=[[0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 0]])  # a quarter turn to the left
-    made, last = splats.between([a, b], 0.5)
-    half = 0.5**0.5
-    np.testing.assert_allclose(made.to_world, [[half, 0, half, 1], [0, 1, 0, 0], [-half, 0, half, 0]], atol=1e-9)
-    np.testing.assert_allclose(last.to_world, b.to_world, atol=1e-9)

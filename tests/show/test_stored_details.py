@@ -13,7 +13,6 @@ from random_bricks import scene_of
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.details import DetailView
-from mmpi_show import details as stored
 from mmpi_show.details import restored_view, stored_view
 from mmpi_show.files import HEADER, read_baked, write_baked
 
@@ -48,18 +47,6 @@ def test_infinity_and_nothing_survive():
         image[..., 3] = inverse
         again = restored_view(stored_view(DetailView(image, torch.arange(24.0))), CPU)
         assert bool((again.image[..., 3] == expected).all()) and again.image[..., :3].abs().max() < 1e-6
-
-
-def test_large_differences_are_kept_smaller(tmp_path, monkeypatch):
-    """With a camera that fits them."""
-    view = details_for(scene_of(opaque_window()), tmp_path).view(0, CPU)
-    monkeypatch.setattr(stored, "MOST_SIDE", 26)
-    small = stored_view(view)
-    assert small.size == (26, 18)
-    after = restored_view(small, CPU)
-    assert torch.allclose(after.camera[12:16], view.camera[12:16] / 2) and after.image.shape == (18, 26, 4)
-    mean = view.image[..., :3].view(18, 2, 26, 2, 3).mean((1, 3))
-    assert (after.image[..., :3] - mean).abs().mean() < 0.05
 
 
 def test_what_is_written_is_read_and_shown(tmp_path):

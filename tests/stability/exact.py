@@ -1,8 +1,7 @@
 """Exact geometry, blending and compositing to measure the fast paths against, with exact gradients.
 
 Float64 and 60-digit decimals, one ray at a time, every plane by itself. Shares no code with ``scene/geometry.py``,
-``ops``, the sampler or the field: plans come in as plain data. ``test_exact.py`` compares it with
-``tests/oracle.py``, and its gradients with finite differences.
+``ops``, the sampler or the field: plans come in as plain data.
 """
 
 from __future__ import annotations
@@ -25,35 +24,6 @@ FACING = 1e-6
 _DIGITS = Context(prec=60, Emax=10**9, Emin=-(10**9))
 
 
-class Jitter:
-    """Moves the inputs of a step by a few roundings, to find out how much the exact result depends on them.
-
-    Args:
-        unit: largest relative move of a number; 0 moves nothing.
-        network_unit: the same inside the colour networks, which may run in reduced precision.
-        seed: of the moves.
-    """
-
-    def __init__(self, unit: float = 0.0, network_unit: float | None = None, seed: int = 0) -> None:
-        self.unit = unit
-        self.network_unit = unit if network_unit is None else network_unit
-        self.rng = np.random.default_rng(seed)
-
-    def __call__(self, x: Array, size: float | Array | None = None) -> Array:
-        """x moved by up to ``unit`` times ``size`` (its own magnitude)."""
-        return self._move(x, self.unit, size)
-
-    def network(self, x: Array, size: float | Array | None = None) -> Array:
-        return self._move(x, self.network_unit, size)
-
-    def _move(self, x: Array, unit: float, size: float | Array | None) -> Array:
-        if unit == 0:
-            return x
-        return x + self.rng.uniform(-1, 1, np.shape(x)) * unit * (np.abs(x) if size is None else size)
-
-
-STILL = Jitter()
-
 # Geometry ------------------------------------------------------------------------------------------------------------
 
 
@@ -75,17 +45,17 @@ class Crossings:
     """Distance to the nearest border that decides about ``live``, relative to such a sum."""
 
 
-def in_frame(mpi: MPIPlan, origin: Array, direction: Array, jitter: Jitter = STILL) -> tuple[Array, Array, float]:
+def in_frame(mpi: MPIPlan, origin: Array, direction: Array) -> tuple[Array, Array, float]:
     """Origin and direction in the MPI's axes, and the sum of the offset's magnitudes."""
     offset = np.asarray(origin, np.float64) - np.asarray(mpi.origin, np.float64)
     axes = np.asarray(mpi.axes, np.float64)
     reach = float(np.abs(offset).sum())
-    return jitter(axes @ offset, reach), jitter(axes @ np.asarray(direction, np.float64), 1.0), reach
+    return axes @ offset, axes @ np.asarray(direction, np.float64), reach
 
 
-def cross(mpi: MPIPlan, origin: Array, direction: Array, near: float, far: float, jitter: Jitter = STILL) -> Crossings:
+def cross(mpi: MPIPlan, origin: Array, direction: Array, near: float, far: float) -> Crossings:
     """Intersects a ray with every plane of an MPI."""
-    o, d, reach = in_frame(mpi, origin, direction, jitter)
+    o, d, reach = in_frame(mpi, origin, direction)
     count = mpi.planes
     facing_margin = abs(d[2] - FACING)
     if not d[2] > FACING:
@@ -126,11 +96,9 @@ def to_ndc(mpi: MPIPlan, u: Array, v: Array, w: Array) -> Array:
     return np.stack([2 * (u - u0) / (u1 - u0) - 1, 2 * (v - v0) / (v1 - v0) - 1, s], -1)
 
 
-def place_in(
-    mpi: MPIPlan, origin: Array, direction: Array, inverse_t: float, jitter: Jitter = STILL
-) -> tuple[Array, float] | None:
+def place_in(mpi: MPIPlan, origin: Array, direction: Array, inverse_t: float) -> tuple[Array, float] | None:
     """NDC of the point at 1/t along a ray (0: infinity) and the size of its numbers; None behind the MPI."""
-    o, d, reach = in_frame(mpi, origin, direction, jitter)
+    o, d, reach = in_frame(mpi, origin, direction)
     x, y, z = o * inverse_t + d
     if z <= 0:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from functools import partial
@@ -11,7 +12,6 @@ import torch
 from stability import exact
 from stability.cases import UNIT, Case, Outcome, Precision, compare, float32, single, tried
 from stability.exact import Array
-from stability.exact_ray import corners_of
 
 from mmpi_ns.ops.depth_sums import depth_sums
 from mmpi_ns.ops.interpolate import interpolate
@@ -22,6 +22,17 @@ from mmpi_ns.training import losses
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Lookups -------------------------------------------------------------------------------------------------------------
+
+
+def _corners_of(position: Array, shape: tuple[int, ...]) -> list[tuple[tuple[int, ...], float]]:
+    """(index, weight) of the texels around a position in [-1, 1]^D; corners of the range are texel centres."""
+    axes = []
+    for x, n in zip(position, shape, strict=True):
+        at = min(max((float(x) + 1) / 2 * (n - 1), 0.0), n - 1.0)
+        lower = min(math.floor(at), n - 2)
+        axes.append(((lower, 1 - (at - lower)), (lower + 1, at - lower)))
+    corners = itertools.product(*axes)
+    return [(tuple(i for i, _ in corner), math.prod(weight for _, weight in corner)) for corner in corners]
 
 
 def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
@@ -38,7 +49,7 @@ def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
     wanted, slope, sizes = np.zeros((len(uv), 2)), np.zeros_like(images), np.zeros_like(images)
     reads = np.zeros(images.shape[:3])
     for i, (u, v) in enumerate(uv):
-        for texel, weight in corners_of((v, u), (side, 3)):
+        for texel, weight in _corners_of((v, u), (side, 3)):
             at = (planes[i], *texel)
             wanted[i] += weight * images[at]
             slope[at] += weight * by[i]

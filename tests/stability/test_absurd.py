@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -47,15 +46,6 @@ def _dense(trainer: MMPITrainer) -> None:
     trainer._run.field.density.data.normal_(generator=torch.Generator().manual_seed(0)).mul_(1e3)
 
 
-def _one_image(config: Any, scene: Path) -> None:
-    path = scene / "one-image.json"
-    meta = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
-    meta["train_filenames"] = meta["train_filenames"][:1]
-    path.write_text(json.dumps(meta), encoding="utf-8")
-    config.data = config.pipeline.datamanager.data = path
-    config.pipeline.datamanager.dataparser.data = path
-
-
 def _turned(mpi: MPIPlan) -> MPIPlan:
     x, y, z = mpi.axes
     back = tuple(tuple(-v for v in row) for row in (x, z))
@@ -65,9 +55,7 @@ def _turned(mpi: MPIPlan) -> MPIPlan:
 ABSURDITIES = (
     Absurdity("learning rates x 100", _rates),
     Absurdity("raw densities start at N(0, 1) x 1e3", start=_dense),
-    Absurdity("one training image", _one_image),
     Absurdity("two identical MPIs", mpis=lambda mpis: (mpis[0], replace(mpis[0], name="its twin"))),
-    Absurdity("one of two MPIs faces away", mpis=lambda mpis: (mpis[0], _turned(mpis[0]))),
     Absurdity("the only MPI faces away", mpis=lambda mpis: (_turned(mpis[0]),)),
 )
 OPTIONS = (

@@ -10,8 +10,8 @@ from PIL import Image
 
 from mmpi_scene import make_scene, render, sfm_points
 from mmpi_scene.__main__ import SceneCommand
-from mmpi_scene.dataset import Exposure, light_of, make_exposure, tone
-from mmpi_scene.movers import MOVER, moving_mask, with_movers
+from mmpi_scene.dataset import light_of, make_exposure
+from mmpi_scene.movers import moving_mask, with_movers
 
 FRAMES = {"count": 16, "width": 96, "height": 54, "length": 12.0}
 
@@ -36,27 +36,6 @@ def written(tmp_path_factory):
 # Exposure
 
 
-def test_the_tone_curve_rises_from_black_to_white_and_light_is_its_inverse():
-    x = np.linspace(0, 1, 1001)
-    assert tone(x[[0, -1]]).tolist() == [0, 1] and (np.diff(tone(x)) > 0).all()
-    assert np.abs(tone(light_of(x)) - x).max() < 1e-6
-
-
-def test_a_gain_of_one_without_vignetting_changes_nothing(walk):
-    image = render(walk, 3)[0]
-    same = Exposure(np.ones((16, 3)), 0.0).expose(walk.cameras, 3, image)
-    assert np.abs(same - image).max() < 1e-6
-
-
-def test_light_grows_with_the_gain_until_it_is_white(walk):
-    image = render(walk, 3)[0]
-    gains = np.tile([5.0, 1.0, 0.5], (16, 1))
-    light = light_of(Exposure(gains, 0.4).expose(walk.cameras, 3, image))
-    x, y = np.meshgrid(np.arange(96) + 0.5 - 48, np.arange(54) + 0.5 - 27)
-    wanted = light_of(image) * [5.0, 1.0, 0.5] * (1 - 0.4 * (x * x + y * y) / (48**2 + 27**2))[..., None]
-    assert np.abs(light - np.minimum(wanted, 1)).max() < 1e-5 and (wanted > 1).any()
-
-
 def test_automatic_gains_vary_three_fold_and_dark_images_get_more(walk):
     scene = make_scene("walk", count=80, width=96, height=54, length=24.0)
     exposure = make_exposure("auto", scene)
@@ -67,12 +46,6 @@ def test_automatic_gains_vary_three_fold_and_dark_images_get_more(walk):
         assert 1.04 < (exposure.gains[:, channel] / green).max() <= 1.1 + 1e-9
     light = [light_of(render(scene, i)[0]).mean() for i in range(0, 80, 4)]
     assert np.corrcoef(np.log(light), np.log(green[::4]))[0, 1] < -0.6
-
-
-def test_vignetting_alone_has_one_exposure(walk):
-    exposure = make_exposure("vignetting", walk)
-    assert exposure is not None and (exposure.gains == 1).all() and exposure.vignetting == 0.5
-    assert make_exposure("none", walk) is None
 
 
 def test_the_file_says_how_each_image_was_exposed(written, busy):
@@ -110,35 +83,9 @@ def test_masks_hold_all_that_movers_change_and_little_else(walk, busy):
     assert masked > 300 and changed > 0.85 * masked
 
 
-def test_test_images_show_the_street_without_movers(walk, busy, written):
-    number = int(np.flatnonzero(walk.cameras.is_test)[0])
-    assert np.array_equal(render(busy.filmed_by(number), number)[0], render(walk, number)[0])
-    assert not moving_mask(busy, number).any()
-    assert not np.asarray(Image.open(written / "moving" / f"frame_{number + 1:05d}.png")).any()
-
-
-def test_movers_keep_their_looks_and_move(busy):
-    first, later = busy.movers(2), busy.movers(3)
-    assert len(first) == len(later) > 10
-    assert sorted(first.colors.reshape(-1).tolist()) == sorted(later.colors.reshape(-1).tolist())
-    assert not np.allclose(np.sort(first.center[:, 0]), np.sort(later.center[:, 0]))
-
-
 def test_no_keypoint_lies_on_a_mover(busy):
     found = sfm_points(busy, 300, noise_pixels=0.0, outliers=0.0)
     for i in np.unique(found.camera):
         hit = busy.filmed_by(i).hit(*busy.cameras.rays(i, found.pixel[found.camera == i]))[1]
         if not busy.cameras.is_test[i]:
             assert not (busy.filmed_by(i).moving[hit] & (hit >= 0)).any()
-
-
-def test_exact_masks_are_beside_the_images_and_not_in_transforms_json(written):
-    meta = json.loads((written / "transforms.json").read_text())
-    assert not any("mask_path" in frame for frame in meta["frames"])
-    masks = [np.asarray(Image.open(p)) for p in sorted((written / "moving").iterdir())]
-    assert len(masks) == 16 and {0, MOVER} <= set(np.unique(masks).tolist()) <= {0, 128, 255}
-
-
-def test_nothing_moves_in_a_room():
-    with pytest.raises(ValueError, match="choose street"):
-        with_movers(make_scene("room", count=2, width=32, height=24), 3)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import pycolmap
 import pytest
-from procedural import keypoint_errors
 
-from mmpi_scene import Scene, make_scene, sfm_points, write_dataset
-from mmpi_scene.primitives import BOX, SPHERE, Kit, Tracer
+from mmpi_scene import Scene, make_scene
+from mmpi_scene.primitives import BOX, SPHERE
 
 
 @pytest.fixture(scope="module")
@@ -55,68 +51,3 @@ def test_first_hits_are_those_of_a_slow_search_through_every_solid(name):
     hit = np.isfinite(wanted)
     assert np.allclose(distance[hit], wanted[hit], rtol=1e-9)
     assert np.allclose(every[row[hit], np.flatnonzero(hit)], wanted[hit], rtol=1e-9) and (row[~hit] == -1).all()
-
-
-def test_a_box_turns_from_x_to_y():
-    kit = Kit(0, 0)
-    kit.box((6.0, 0.0, 1.0), (4.0, 0.4, 2.0), "plaster", (0.5,) * 3, yaw=np.pi / 6)
-    tracer = Tracer(kit.done(), 100.0)
-    along = 1.8 * np.array([[np.cos(np.pi / 6), np.sin(np.pi / 6)], [np.cos(np.pi / 6), -np.sin(np.pi / 6)]])
-    above = np.column_stack([np.add(along, [6.0, 0.0]), [9.0, 9.0]])
-    distance, row = tracer(above, np.tile([0.0, 0.0, -1.0], (2, 1)))
-    assert distance.tolist() == [7.0, np.inf] and row.tolist() == [0, -1]
-
-
-def test_solids_beyond_reach_or_limit_do_not_count():
-    kit = Kit(0, 0)
-    kit.box((5.5, 0.0, 1.5), (1.0, 30.0, 30.0), "plaster", (0.5,) * 3)  # its bounding sphere is near in any case
-    ray = np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]])
-    assert Tracer(kit.done(), 5.1)(*ray)[0][0] == 5 and np.isinf(Tracer(kit.done(), 4.9)(*ray)[0][0])
-    assert np.isinf(Tracer(kit.done(), 100.0)(*ray, limit=4.9)[0][0])
-
-
-def test_tracks_are_near_enough_and_have_the_colours_that_cameras_see(street):
-    scene = replace(street, track_range=14.0)
-    found = sfm_points(scene, 300, noise_pixels=0.0, outliers=0.0)
-    eyes = scene.cameras.camera_to_worlds[found.camera, :, 3]
-    rays = found.true_points[found.point] - eyes
-    away = np.linalg.norm(rays, axis=-1, keepdims=True)
-    assert len(found.points) > 200 and 12 < away.max() < 14
-    first = np.searchsorted(found.point, np.arange(len(found.points)))
-    seen = scene.trace(eyes[first], (rays / away)[first], 1 / scene.cameras.focal)[1]
-    # Textures are finer or coarser by distance, so single points differ.
-    assert np.median(np.abs(found.colors / 255 - seen).max(-1)) < 0.03
-    warmth = [c[:, 0] - c[:, 2] for c in (found.colors / 255, seen)]
-    assert np.corrcoef(*warmth)[0, 1] > 0.9
-
-
-def test_rays_of_a_track_lie_apart():
-    """On a drive of a metre and a half, most of what is far ahead cannot be triangulated."""
-    scene = make_scene("street", count=5, width=96, height=48, length=1.5)
-    found = sfm_points(scene, 200, noise_pixels=0.0, outliers=0.0)
-    rays = found.true_points[found.point] - scene.cameras.camera_to_worlds[found.camera, :, 3]
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    widest = []
-    for p in range(len(found.points)):
-        own = rays[found.point == p]
-        widest.append(np.degrees(np.arccos(np.clip((own @ own.T).min(), -1, 1))))
-    assert len(widest) > 100 and 0.5 <= min(widest) < 0.7
-
-
-def test_files_hold_the_points_their_colours_and_tracks(street, tmp_path):
-    found = write_dataset(street, tmp_path / "out", points=120, images=False)
-    head, _, body = (tmp_path / "out/sparse_pc.ply").read_bytes().partition(b"end_header\n")
-    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property")]
-    assert names == ["x", "y", "z", "red", "green", "blue"]
-    table = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    order = np.lexsort(table["xyz"].T), np.lexsort(found.points.astype(np.float32).T)
-    assert np.allclose(table["xyz"][order[0]], found.points[order[1]], rtol=1e-6)
-    assert np.array_equal(table["rgb"][order[0]], found.colors[order[1]])
-    model = pycolmap.Reconstruction(str(tmp_path / "out/colmap/sparse/0"))
-    for p in range(120):
-        point = model.points3D[p + 1]
-        assert np.allclose(point.xyz, found.points[p]) and (point.color == found.colors[p]).all()
-        own = found.point == p
-        track = [(e.image_id - 1, *model.images[e.image_id].points2D[e.point2D_idx].xy) for e in point.track.elements]
-        assert np.allclose(track, np.column_stack([found.camera[own], found.pixel[own]]), atol=1e-4)
-        assert point.error == pytest.approx(keypoint_errors(street, found)[own].mean(), abs=1e-4)

@@ -9,16 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from procedural import keypoint_errors
 from reprojection import median_reprojection_error
 
 from mmpi_priors.sfm import find_sfm_model
-from mmpi_scene import SCENES, Cameras, Scene, make_scene, render, sfm_points, write_dataset
-from mmpi_scene.__main__ import SceneCommand
-from mmpi_scene.dataset import PARTS
-from mmpi_scene.materials import Noise, pulse
+from mmpi_scene import SCENES, Cameras, Scene, make_scene, render, write_dataset
 from mmpi_scene.primitives import Kit, look
-from mmpi_scene.road import Road
 from mmpi_scene.scene import Light
 from mmpi_scene.surroundings import meadow, open_sky
 
@@ -51,11 +46,6 @@ def street():
 
 
 @pytest.fixture(scope="module")
-def street_points(street):
-    return sfm_points(street, 400, noise_pixels=0.4, outliers=0.1)
-
-
-@pytest.fixture(scope="module")
 def dataset(street, tmp_path_factory):
     folder = tmp_path_factory.mktemp("street") / "out"
     write_dataset(street, folder, points=300)
@@ -82,18 +72,6 @@ def test_distance_to_turned_boxes_spheres_and_cylinders_is_exact():
     assert np.allclose(scene.hit(origins, directions)[0], [6 - np.sqrt(2), 5.0, 3.5], rtol=1e-14)
     above, down = directions_to((-4.2, 0.1, 0.0), origin=(-4.2, 0.1, 10.0))
     assert np.allclose(scene.hit(above, down)[0], 7.0, rtol=1e-14)
-
-
-def test_culling_changes_no_hit(street):
-    """Rays in one packet, in any order and one by one meet the same solids."""
-    random = np.random.default_rng(0)
-    d = random.normal(size=(300, 3))
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    o = random.uniform([0, -3, 0.5], [12, 3, 3], (300, 3))
-    distance, row = street.hit(o, d)
-    single = [street.hit(o[i : i + 1], d[i : i + 1]) for i in range(300)]
-    assert (row == [s[1][0] for s in single]).all() and (row >= 0).sum() > 80
-    assert np.allclose(distance, [s[0][0] for s in single], rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -142,63 +120,7 @@ def test_equal_seeds_give_equal_bytes_and_others_do_not(tmp_path):
     )
 
 
-def test_render_gives_the_distance_of_the_central_rays(street):
-    depth = render(street, 2)[1]
-    pixels = np.stack(np.meshgrid(np.arange(96) + 0.5, np.arange(48) + 0.5), -1).reshape(-1, 2)
-    assert np.array_equal(depth.reshape(-1), street.trace(*street.cameras.rays(2, pixels))[0].astype(np.float32))
-    assert np.isinf(depth).any() and (depth[-1] < 12).all()
-
-
-def test_images_are_antialiased(street):
-    """A render lies near one of 25 rays a pixel, much nearer than one ray with unfiltered textures."""
-    image = render(street, 3)[0]
-    pixels = np.stack(np.meshgrid(np.arange(96) + 0.5, np.arange(48) + 0.5), -1).reshape(-1, 2)
-    inner = (np.arange(5) + 0.5) / 5 - 0.5
-    shifts = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 1, 2)
-    rays = [street.cameras.rays(3, pixels + shift) for shift in shifts]
-    reference = np.mean([street.trace(*r, pixel=0.2 / street.cameras.focal)[1] for r in rays], 0).reshape(image.shape)
-    aliased = street.trace(*street.cameras.rays(3, pixels))[1].reshape(image.shape)
-
-    def error(x):
-        return np.sqrt(((x - reference) ** 2).mean())
-
-    assert error(image) < 0.025 and error(image) < 0.5 * error(aliased)
-
-
-def test_textures_average_over_their_footprint():
-    x, width = np.linspace(-2, 3, 50, dtype=np.float32), np.full(50, 0.37, np.float32)
-    fine = x[:, None] + 0.37 * ((np.arange(2000) + 0.5) / 2000 - 0.5)
-    inside = ((fine % 1 >= 0.2) & (fine % 1 < 0.5)).mean(1)
-    assert np.allclose(pulse(x, width, 0.2, 0.5), inside, atol=2e-3)
-    noise, u = Noise(0), np.random.default_rng(0).uniform(0, 99, (2, 5000)).astype(np.float32)
-    spread = [float(noise(*u, np.full(5000, w, np.float32)).std()) for w in (0.01, 1.0, 20.0)]
-    assert 0.4 < spread[0] < 0.6 and spread[0] > spread[1] > 0.1 and spread[2] < 0.01
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_no_image_is_plain(name):
-    """Colours vary, and vary within small neighbourhoods too."""
-    scene = make_scene(name, count=4, width=64, height=40, **({"length": 20.0} if SCENES[name].length else {}))
-    for i in range(0, 4, 2):
-        image = render(scene, i)[0]
-        assert image.std() > 0.08
-        blocks = image.reshape(5, 8, 8, 8, 3).std((1, 3)).mean(-1)
-        assert (blocks > 0.005).mean() > 0.9
-
-
 # Points and tracks
-
-
-def test_tracks_hold_only_cameras_that_see_the_point(street, street_points):
-    found = street_points
-    good = ~found.outlier[found.point]
-    eyes = street.cameras.camera_to_worlds[found.camera[good], :, 3]
-    offset = found.true_points[found.point[good]] - eyes
-    away = np.linalg.norm(offset, axis=-1)
-    hit = street.trace(eyes, offset / away[:, None])[0]
-    assert np.allclose(hit, away, rtol=1e-5, atol=1e-4)
-    assert np.bincount(found.point).min() >= 3
-    assert len(np.unique(np.stack([found.point, found.camera]), axis=1).T) == len(found.point)
 
 
 def test_what_stands_in_front_hides_a_point():
@@ -218,82 +140,10 @@ def test_what_stands_in_front_hides_a_point():
     assert [visible(hidden, i, point)[0][0] for i in range(5)] == [True, True, False, True, True]
 
 
-def test_keypoint_noise_is_as_asked(street, street_points):
-    found = street_points
-    for camera in range(len(street.cameras)):
-        rows = (found.camera == camera) & ~found.outlier[found.point]
-        exact = street.cameras.project(camera, found.true_points[found.point[rows]])[0]
-        assert np.abs((found.pixel[rows] - exact).std(0) - 0.4).max() < 0.08
-        assert np.abs((found.pixel[rows] - exact).mean()) < 0.08
-    # Triangulation takes up three of two numbers a keypoint.
-    error = keypoint_errors(street, found)
-    share = 1 - 3 * len(found.points) / (2 * len(found.point))
-    assert np.isclose(np.sqrt((error**2).mean() / 2), 0.4 * np.sqrt(share), rtol=0.08)
-
-
-def test_outliers_are_as_many_as_asked_and_fit_their_keypoints(street, street_points):
-    found = street_points
-    assert len(found.points) == 400 and found.outlier.sum() == 40
-    moved = np.linalg.norm(found.points - found.true_points, axis=-1)
-    eye = street.cameras.camera_to_worlds[found.camera[np.searchsorted(found.point, np.arange(400))], :, 3]
-    relative = moved / np.linalg.norm(found.true_points - eye, axis=-1)
-    assert np.median(relative[found.outlier]) > 0.2 and np.median(relative[~found.outlier]) < 0.05
-    assert np.median(keypoint_errors(street, found)[found.outlier[found.point]]) < 1.0
-    exact = sfm_points(street, 100, noise_pixels=0.0, outliers=0.0)
-    assert not exact.outlier.any() and np.abs(exact.points - exact.true_points).max() < 1e-6
-
-
-def test_points_out_of_range_are_refused(street):
-    for bad in ({"count": -1}, {"count": 5, "noise_pixels": -1.0}, {"count": 5, "outliers": 1.0}):
-        with pytest.raises(ValueError, match="outliers"):
-            sfm_points(street, **bad)
-    assert len(sfm_points(street, 0).points) == 0
-
-
 # Long roads
 
 
-def test_a_road_is_as_long_as_asked_and_finds_its_own_places():
-    for length in (100.0, 1000.0):
-        cameras = make_scene("long-road", length=length).cameras
-        road = np.linalg.norm(np.diff(cameras.camera_to_worlds[:, :, 3], axis=0), axis=-1).sum()
-        assert abs(road / length - 1) < 0.02
-    road = Road(500.0, ((9.0, 250.0, 1.0), (38.0, 900.0, 2.0)))
-    along, aside = np.random.default_rng(0).uniform([0, -9], [500, 9], (200, 2)).T
-    places, heading = road.at(along, aside)
-    found = road.locate(places)
-    assert np.abs(found[0] - along).max() < 0.1 and np.abs(found[1] - aside).max() < 0.02
-    assert np.abs(found[2] - heading).max() < 0.002 and np.ptp(heading) > 0.3
-
-
-def test_what_a_long_road_costs_grows_linearly_and_its_images_cost_no_more():
-    scenes = {n: make_scene("long-road", length=1000.0 * n) for n in (1, 4)}
-    solids = {n: len(s.primitives) for n, s in scenes.items()}
-    assert 2.6 < solids[4] / solids[1] < 4.2
-    near = {n: [len(s.tracer.near(x, x)) for x in s.cameras.camera_to_worlds[:, 0, 3]] for n, s in scenes.items()}
-    assert max(near[4]) < 1.25 * max(near[1]) and max(near[4]) < solids[4] / 4
-
-
-def test_ten_kilometres_of_cameras_without_images(tmp_path):
-    scene = make_scene("long-road", count=300, length=10000.0, width=64, height=32)
-    found = write_dataset(scene, tmp_path / "long", points=50, images=False)
-    assert len(found.points) == 0  # 33 m apart: no point is near enough to three cameras
-    model = find_sfm_model(tmp_path / "long" / "colmap" / "sparse" / "0")
-    assert model is not None and len(model.names) == 300 and len(model.points) == 0
-    meta = json.loads((tmp_path / "long" / "transforms.json").read_text())
-    assert len(meta["frames"]) == 300 and not (tmp_path / "long" / "images").exists()
-    assert np.ptp([f["transform_matrix"][0][3] for f in meta["frames"]]) > 8000
-
-
 # Data sets
-
-
-def test_split_is_disjoint_and_complete(dataset):
-    meta = json.loads((dataset / "transforms.json").read_text())
-    train, val, test = (set(meta[f"{s}_filenames"]) for s in ("train", "val", "test"))
-    assert val == test and not train & test and train | test == {f["file_path"] for f in meta["frames"]}
-    assert len(train) == len(test) == 4
-    assert sum(make_scene("room", **{**SMALL, "count": 64}).cameras.is_test) == 8
 
 
 def test_nerfstudio_and_the_data_manager_read_what_was_written(dataset, street):
@@ -344,6 +194,15 @@ def test_colmap_model_has_the_cameras_and_the_errors_it_states(dataset, street):
     assert 0.1 < np.mean([p.error for p in model.points3D.values()]) < 0.5
 
 
+def test_impossible_scenes_are_refused_with_the_remedy():
+    for bad, words in (
+        ({"name": "moon"}, "choose one of"), ({"name": "room", "length": 5.0}, "leave it out"),
+        ({"name": "street", "count": 0}, "count"), ({"name": "street", "length": -1.0}, "length"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            make_scene(**bad)
+
+
 def test_a_folder_in_use_is_left_as_it_is(tmp_path, monkeypatch, capsys):
     from mmpi_scene import __main__ as script
 
@@ -362,24 +221,3 @@ def test_a_folder_in_use_is_left_as_it_is(tmp_path, monkeypatch, capsys):
             and "\n" not in message
         )
         assert [p.name for p in folder.iterdir()] == ["notes.txt"]
-
-
-def test_overwrite_replaces_a_data_set_whole(tmp_path, capsys):
-    options = {"width": 32, "height": 24, "points": 40}
-    SceneCommand("room", tmp_path / "out", count=4, **options).main()
-    assert f"ns-train mmpi --data {tmp_path / 'out'}" in capsys.readouterr().out
-    with pytest.raises(FileExistsError, match="--overwrite"):
-        SceneCommand("object", tmp_path / "out", count=3, **options).main()
-    assert len(list((tmp_path / "out" / "images").iterdir())) == 4
-    SceneCommand("object", tmp_path / "out", count=3, overwrite=True, **options).main()
-    assert len(list((tmp_path / "out" / "images").iterdir())) == 3
-    assert {p.name for p in (tmp_path / "out").iterdir()} <= set(PARTS)
-
-
-def test_impossible_scenes_are_refused_with_the_remedy():
-    for bad, words in (
-        ({"name": "moon"}, "choose one of"), ({"name": "room", "length": 5.0}, "leave it out"),
-        ({"name": "street", "count": 0}, "count"), ({"name": "street", "length": -1.0}, "length"),
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match=words):
-            make_scene(**bad)

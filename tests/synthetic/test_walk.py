@@ -43,15 +43,6 @@ def test_rays_go_where_pixels_come_from(walk):
     assert np.abs(walk.cameras.project(5, origins + 12.0 * directions)[0] - pixels).max() < 1e-10
 
 
-def test_what_lies_beyond_the_corners_is_seen_outside_the_image(walk):
-    pose, size = walk.cameras.camera_to_worlds[0], np.array([96, 54])
-    for tangent in (0.9, 1.5, 3.0, 10.0):
-        angle = np.linspace(0, 2 * np.pi, 50)
-        local = np.stack([tangent * np.cos(angle), tangent * np.sin(angle), -np.ones(50)], -1)
-        pixels = walk.cameras.project(0, local @ pose[:, :3].T + pose[:, 3])[0]
-        assert ((pixels < 0) | (pixels > size)).any(-1).all()
-
-
 def test_nerfstudio_reads_the_lens_and_draws_the_same_rays(walk, folder):
     from training_runs import datamanager
 
@@ -81,32 +72,3 @@ def test_points_and_depths_agree_with_the_lens(walk, folder):
     pixels, depths = walk.cameras.project(2, points[seen])
     stored = millimetres[tuple(pixels.astype(int).T[::-1])] / 1000
     assert seen.sum() > 20 and np.median(np.abs(stored / depths - 1)) < 0.02
-
-
-def test_the_walk_shakes_turns_and_stays_on_the_carriageway():
-    scene = make_scene("walk", count=300, width=96, height=54, length=60.0)
-    poses = scene.cameras.camera_to_worlds
-    facing = -poses[:, :, 2]
-    step = np.degrees(np.arccos(np.clip((facing[1:] * facing[:-1]).sum(-1), -1, 1)))
-    assert 0.3 < np.median(step) < 3.0 and step.max() < 6.0
-    yaw = np.degrees(np.unwrap(np.arctan2(facing[:, 1], facing[:, 0])))
-    assert np.ptp(yaw) > 60 and 0.2 < np.degrees(np.abs(poses[:, 2, 0]).mean()) < 2.0
-    assert np.ptp(poses[:, 2, 3]) < 0.2
-    around = np.stack([np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8), np.zeros(16)], -1)
-    nearest = [scene.hit(np.broadcast_to(p, (16, 3)), around)[0].min() for p in poses[::5, :, 3]]
-    assert min(nearest) > 0.3
-
-
-def test_several_processes_write_the_same_files(walk, folder, tmp_path):
-    write_dataset(walk, tmp_path / "out", points=300, noise_pixels=0.0, outliers=0.0, processes=3)
-    files = sorted(p.relative_to(folder) for p in folder.rglob("*.png"))
-    assert len(files) == 24 and all((folder / f).read_bytes() == (tmp_path / "out" / f).read_bytes() for f in files)
-
-
-def test_an_image_that_cannot_be_written_ends_all_processes(walk, tmp_path, monkeypatch):
-    from mmpi_scene import dataset
-
-    monkeypatch.setattr(dataset, "image_name", lambda camera: f"{camera}.nothing" if camera == 3 else f"{camera}.png")
-    with pytest.raises(ValueError, match="unknown file extension"):
-        write_dataset(walk, tmp_path / "out", points=0, tracks=False, processes=2)
-    assert not (tmp_path / "out" / "transforms.json").exists()

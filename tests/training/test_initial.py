@@ -152,15 +152,6 @@ def test_densities_stay_finite_for_any_number_of_planes_and_mpis(planes, mpis):
         assert torch.isfinite(field.features.data).all()
 
 
-def test_rays_that_meet_nothing_and_no_rays_change_nothing():
-    field, *_ = straight(width=9, height=9)
-    before = field.density.data.clone(), field.features.data.clone()
-    for rays in ([[[0.0, 0.0, 0.0]], [[0.0, 0.0, -1.0]], [[0.5, 1e-3]]], [np.zeros((0, n)) for n in (3, 3, 2)]):
-        start_from_votes(field, votes_of(field, *rays, np.zeros((len(rays[0]), 3))))
-    assert torch.equal(before[0], field.density.data)
-    assert torch.equal(before[1], field.features.data)
-
-
 def prepared(scene, plan_file, folder, steps, **settings):
     """The field of a run after the callbacks before each of these steps."""
     config = trainer_config(scene, plan_file, folder, 60)
@@ -187,13 +178,3 @@ def test_a_run_starts_from_the_depths_of_its_pixels_once(scene, plan_file, tmp_p
 def test_without_depth_priors_every_plane_starts_alike(scene, plan_file, tmp_path):
     field = prepared(scene, plan_file, tmp_path, [0], dense_depth=False, depth_images=False, sfm_path="none")
     assert not field.density.data[BRICK:].any() and not field.features.data.any()
-
-
-def test_a_long_run_draws_half_of_its_rays_until_texels_have_grown(scene, plan_file, tmp_path):
-    trainer = ready(trainer_config(scene, plan_file, tmp_path, 3_000))
-    drawn = {}
-    for step in (0, 374, 375, 2_999):  # of the first 1,500, texels double after an eighth and a quarter
-        for callback in trainer.callbacks:
-            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        drawn[step] = len(trainer.pipeline.datamanager.next_train(step)[1]["indices"])
-    assert drawn == {0: 32, 374: 32, 375: 64, 2_999: 64}

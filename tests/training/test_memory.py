@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import platform
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -13,9 +10,7 @@ import torch
 from hand_made import make_mpi
 from tiny_scene import TRAIN, WIDTH, image_of, write_scene
 from training_runs import datamanager, load, ready, trainer_config
-from waits import step_bytes
 
-from mmpi_ns.scene import visible_tiles
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training import memory
@@ -55,16 +50,6 @@ def test_memory_is_that_of_tables_moments_and_pixels(scene, plan_file, tmp_path,
     assert told and float(told[1]) == pytest.approx((tables[0] + pixels[0]) / 2**30, abs=0.006)
 
 
-def test_pixels_read_window_by_window_count_for_that_window(scene):
-    by_window = datamanager(scene, resident_pixels=0)
-    cameras = np.array([1, 2, 5])
-    told = by_window.pixel_bytes(cameras), by_window.pixel_bytes()
-    by_window.use_cameras(cameras)
-    assert told[0] == by_window.sources.pixels.nbytes < told[1]
-    at_once = datamanager(scene)
-    assert at_once.pixel_bytes(cameras) == at_once.pixel_bytes() == told[1]
-
-
 @pytest.mark.parametrize("masks", [False, True])
 def test_of_a_window_with_too_many_pixels_so_many_are_held_as_is_told(scene, tmp_path, masks, capsys):
     data = write_scene(tmp_path / "masked", masks=True) if masks else scene
@@ -93,69 +78,6 @@ def test_the_largest_window_decides_what_memory_is_told():
     assert "2 windows of 40 steps" in said and "at most 3.50 GiB (tables and moments 3.00, pixels 0.50)" in said
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
-def test_what_a_step_frees_is_there_for_the_next_one():
-    """Page faults of arrays that are taken and freed again and again, in a process of its own."""
-    work = """if True:
-        import resource, torch
-        from mmpi_ns.utils.host import keep_freed_memory
-        def faults():
-            before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-            for _ in range(5):
-                parts = [torch.ones(1 << 20) for _ in range(8)]
-                del parts
-            return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-        first = faults()
-        (keeping := keep_freed_memory()).__enter__()
-        faults()
-        print(first, faults())
-    """
-    said = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True, check=True).stdout
-    before, after = map(int, said.split())
-    assert after < 100 < before
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
-def test_what_steps_leave_is_given_back_before_tables_grow_and_zeros_take_nothing():
-    """Resident memory, in a process of its own: between the parts that go lie parts that stay."""
-    work = """if True:
-        import os, torch
-        from pathlib import Path
-        from mmpi_ns.scene.bricks import resample
-        from mmpi_ns.scene.texels import BRICK, make_grids
-        from mmpi_ns.utils.host import give_back_freed_memory, keep_freed_memory
-        from mmpi_ns.utils.pages import lazy_zeros
-        def resident():
-            return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") >> 20
-        (keeping := keep_freed_memory()).__enter__()
-        parts = [torch.ones(n) for _ in range(40) for n in (1 << 20, 1 << 10)]
-        del parts[::2]
-        before = resident()
-        give_back_freed_memory()
-        given = before - resident()
-        old, new = make_grids([(8, 256, 256)]), make_grids([(16, 1024, 1024)])
-        before = resident()
-        nothing = lazy_zeros((len(old[0].places) * BRICK, 1), torch.float32, torch.device("cpu"))
-        table = resample(nothing, old, new)
-        assert table.shape == (len(new[0].places) * BRICK, 1) and not table[::1000].any()
-        print(given, resident() - before)
-    """
-    said = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True, check=True).stdout
-    given, taken = map(int, said.split())
-    assert given > 120 and taken < 20, said
-
-
-def test_tiles_in_reach_are_looked_for_once_in_a_run(scene, plan_file, tmp_path, monkeypatch):
-    """To size the tables, to say so, and to fill them: three times the same at full resolution."""
-    looked, tiles_of = [], visible_tiles._tiles_of
-    monkeypatch.setattr(visible_tiles, "_tiles_of", lambda mpi, *given: looked.append(mpi) or tiles_of(mpi, *given))
-    visible_tiles._remembered.clear()
-    trainer = ready(trainer_config(scene, plan_file, tmp_path, 16, training="joint"))
-    trainer.train()
-    full = [mpi for mpi in looked if mpi in trainer.pipeline.model.progress.windows.plans[0].mpis]
-    assert len(full) == len(set(looked) & set(full)) == 2 and len(looked) == len(set(looked)) == 6
-
-
 GPU = "cuda:1"
 WORK = Work(8, False, pixel_rays=16384)
 
@@ -177,26 +99,6 @@ def free(monkeypatch):
 
 def windows_of(plan: ScenePlan) -> WindowedPlan:
     return WindowedPlan.single(plan)
-
-
-def test_a_gpu_keeps_room_for_a_step_a_picture_and_the_allocator(free):
-    """14.5 GiB of tables do not fit in 14.6: a step would find no room at full resolution."""
-    windows = windows_of(large_plan(200e6))
-    tables, reserve = training_bytes(windows.plans[0], None, WORK), reserved_bytes(windows.plans[0], WORK, GPU)
-    assert 1 << 30 < reserve < 4 << 30 and reserved_bytes(windows.plans[0], WORK, "cpu") == 0
-    free((tables + reserve) / 2**30 + 0.01)
-    assert fit_memory(windows, lambda _: None, WORK, GPU) is windows
-    free(tables / 2**30 + 0.1)
-    with pytest.raises(InputError, match="fewer texels"):
-        fit_memory(windows, lambda _: None, WORK, GPU)
-
-
-def test_the_reserve_follows_the_rays_and_what_renders_them():
-    plan = large_plan(1e7)
-    small, large = (step_bytes(plan, Work(8, False, rays)) for rays in (1024, 16384))
-    assert 10 * small < large < 16.01 * small
-    assert step_bytes(plan, Work(8, True, 1024, all_mpis=True)) > 3 * small
-    assert step_bytes(plan, Work(8, False, 1024, threshold=0.0)) > small
 
 
 @pytest.mark.parametrize(("gib", "places"), [(64, 0), (12, 1), (6, 1)])
@@ -221,18 +123,3 @@ def test_where_hardly_any_texel_fits_a_run_is_refused(free, stubborn):
     with pytest.raises(InputError, match="GiB are free"):
         fit_memory(plan, lambda _: None, WORK, GPU, lambda most: asked.append(most) or plan)
     assert len(asked) == (memory.ATTEMPTS - 1 if stubborn else 0)
-
-
-def test_a_run_without_room_for_its_texels_plans_larger_ones(scene, tmp_path, monkeypatch, capsys):
-    """Of the rule's plan; a plan of the user's is refused."""
-    config = trainer_config(scene, None, tmp_path, 3000, training="joint")
-    texels = ready(config).pipeline.model.progress.windows.plans[0].texels
-    monkeypatch.setattr(memory, "free_memory", lambda device: 35 * texels)
-    monkeypatch.setattr(memory, "SMALLEST_PLAN", 1e3)
-    monkeypatch.setattr(memory, "LEAST_SHARE", 1.0)
-    model = ready(trainer_config(scene, None, tmp_path / "less", 3000, training="joint")).pipeline.model
-    assert model.progress.windows.plans[0].texels < 0.9 * texels
-    assert "texels are made larger" in capsys.readouterr().out
-    plan = tmp_path / "tiny" / "mmpi-small" / "run" / "plan.json"
-    with pytest.raises(InputError, match="fewer texels"):
-        ready(trainer_config(scene, plan, tmp_path / "asked", 3000, training="joint"))

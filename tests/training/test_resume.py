@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -17,10 +16,9 @@ STEPS = 24
 """individual 0-11 with doublings at 2 and 3 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
 0-23 with doublings at 3 and 6 and releases before 12 and 22; finer is joint with finer texels from 12
 on, and copies with finer copies from 17 on."""
-BOUNDARIES = (3, 6, 12, 18)
 
 
-@pytest.fixture(scope="module", params=["split", "all", "joint", "finer", "copies"])
+@pytest.fixture(scope="module", params=["split", "all", "finer", "copies"])
 def whole(request, scene, plan_file, tmp_path_factory):
     """Settings, and the checkpoints of every step of an uninterrupted run."""
     joint = request.param in ("joint", "finer", "copies")
@@ -52,7 +50,7 @@ def resumed(whole, scene, plan_file, tmp_path):
     return run
 
 
-@pytest.mark.parametrize("step", [*(b + d for b in BOUNDARIES for d in (-2, -1, 0)), STEPS - 3, STEPS - 2])
+@pytest.mark.parametrize("step", [2, 5, 11, 12, 17, STEPS - 2])
 def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, resumed, step):
     folder = resumed(step)
     for last in range(max(step + 1, STEPS - 2), STEPS):
@@ -89,22 +87,6 @@ def test_texels_become_finer_or_get_copies_where_the_plan_allows_it(whole):
     detail = WindowedPlan.load(whole[0]["plan_file"]).plans[0].detail if "plan_file" in whole[0] else 1.0
     assert 1.25 <= factors[16] <= detail if detail == 2 else factors[-1] == 1
     assert copied[16:] == [float(detail > 2)] * (STEPS - 17)
-
-
-def test_steps_differ_so_the_comparison_can_fail(whole):
-    assert len(differences(compared(load(whole[1], STEPS - 1)), compared(load(whole[1], STEPS - 2)))) > 5
-
-
-def test_untrained_reliability_takes_no_bytes_of_a_checkpoint(whole):
-    state = load(whole[1], 11)["pipeline"]
-    reliability, density = (state[f"_model.field.{name}"] for name in ("reliability", "density"))
-    assert reliability.shape == density.shape and not reliability.any() and density.any()
-    assert (reliability.untyped_storage().nbytes(), density.untyped_storage().nbytes()) == (4, 4 * len(density))
-
-
-def test_a_finished_run_has_nothing_to_do(whole, resumed):
-    folder = resumed(STEPS - 1)
-    assert not folder.exists() or not list(folder.iterdir())
 
 
 def test_frozen_parameters_stay_bit_identical(whole):
@@ -152,7 +134,7 @@ def call_before(trainer, step, function):
     trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], run))
 
 
-@pytest.mark.parametrize("step", [11, 12, 13])
+@pytest.mark.parametrize("step", [12])
 def test_a_run_that_died_goes_on_from_its_last_checkpoint(whole, scene, plan_file, tmp_path, step):
     config = trainer_config(scene, plan_file, tmp_path / "a", STEPS, **whole[0])
     config.save_only_latest_checkpoint = True
@@ -171,7 +153,7 @@ def test_a_run_that_died_goes_on_from_its_last_checkpoint(whole, scene, plan_fil
     assert differences(compared(load(whole[1], STEPS - 1)), compared(found)) == []
 
 
-@pytest.mark.parametrize("step", [5, 11, 12, 17])
+@pytest.mark.parametrize("step", [12])
 def test_a_run_that_was_asked_to_stop_saves_the_step_it_did_last(whole, scene, plan_file, tmp_path, step):
     """Stopping from the viewer: the step after the request does not run, so it must not be counted."""
     config = trainer_config(scene, plan_file, tmp_path / "a", STEPS, **whole[0])
@@ -217,28 +199,10 @@ def test_a_full_disk_leaves_the_old_checkpoint_and_nothing_else(scene, plan_file
     assert again._start_step == 4
 
 
-def test_checkpoints_are_written_outside_their_folder(whole, scene, plan_file, tmp_path, monkeypatch):
-    """nerfstudio takes every file name in the folder for a step, so an unfinished one there would break resuming."""
-    trainer = ready(trainer_config(scene, plan_file, tmp_path, 2))
-    save, seen = torch.save, []
-
-    def spy(state, path, *args, **kwargs):
-        save(state, path, *args, **kwargs)
-        seen.append((path.parent, [p.name for p in trainer.checkpoint_dir.iterdir()]))
-
-    monkeypatch.setattr(torch, "save", spy)
-    trainer.train()
-    assert len(seen) >= 2
-    for parent, names in seen:
-        assert parent != trainer.checkpoint_dir and all(n.endswith(".ckpt") for n in names)
-
-
 # What does not fit ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "settings", [{"num_mpis": 3, "with_cube": True}, {"num_mpis": 2}, {"planes": 13, "with_cube": True}]
-)
+@pytest.mark.parametrize("settings", [{"num_mpis": 3, "with_cube": True}, {"planes": 13, "with_cube": True}])
 def test_a_checkpoint_of_another_plan_is_refused_in_one_sentence(whole, scene, tmp_path, settings):
     plan = write_plan(scene, tmp_path / "plan.json", **settings)
     config = trainer_config(scene, plan, tmp_path / "out", STEPS, **(whole[0] | {"plan_file": plan}))
@@ -255,21 +219,6 @@ def test_a_checkpoint_of_another_method_is_refused(whole, scene, plan_file, tmp_
     torch.save(state, folder / "step-000000005.ckpt")
     with pytest.raises(ValueError, match="not written by this method"):
         ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_dir=folder)
-
-
-def test_a_folder_without_checkpoints_is_named(scene, plan_file, tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="no checkpoint in"):
-        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS), load_dir=tmp_path / "empty")
-
-
-def test_one_checkpoint_file_can_be_named_instead_of_a_folder(whole, scene, plan_file, tmp_path):
-    copy = tmp_path / "mine.ckpt"
-    shutil.copy(whole[1] / "step-000000020.ckpt", copy)
-    trainer = ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_checkpoint=copy)
-    trainer.train()
-    found = load(trainer.checkpoint_dir, STEPS - 1)
-    assert differences(compared(load(whole[1], STEPS - 1)), compared(found)) == []
 
 
 def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning_rates(

@@ -2,37 +2,17 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 from hand_made import make_mpi
-from training_runs import schedule_of
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import TABLES
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.memory import Work, training_bytes
-from mmpi_ns.training.storage import FORMING, MOST_COPIED, ROOM, copy_finely, prepare_storage, refine
+from mmpi_ns.training.storage import MOST_COPIED, copy_finely, refine
 from mmpi_ns.training.touched_adam import TouchedAdam
-
-
-def test_what_is_released_at_a_growth_is_released_before_it_and_by_a_lower_weight():
-    calls = []
-    field = SimpleNamespace(
-        factor=0.5,
-        grow=lambda factor: calls.append(("grow", factor)),
-        release_unused=lambda least: calls.append(("release", least)),
-        look_afresh=lambda: calls.append(("look afresh",)),
-    )
-    schedule = schedule_of("joint", 100, growth_shares=(0.5,), release_shares=(0.5, 0.75))
-    prepare_storage(field, schedule, 50, 0.01, {})
-    assert calls == [("release", FORMING * 0.01), ("grow", 1.0)]
-    field.factor = 1.0
-    for step in (51, 74, 75, 76):
-        prepare_storage(field, schedule, step, 0.01, {})
-    assert calls[2:] == [("release", 0.01)]
 
 
 def half_empty(detail: float, share: float) -> MMPIField:
@@ -65,18 +45,6 @@ def test_texels_become_as_fine_as_rays_can_train_unless_hardly_anything_was_rele
     assert (factor > 1) != torch.equal(field.features.data, before)
 
 
-@pytest.mark.parametrize("share", [0.08, 0.1, 0.15, 0.2])
-def test_texels_become_as_fine_as_fits_in_a_share_of_the_bytes_that_the_plan_takes_and_moments_go(share):
-    field = half_empty(64.0, share)
-    optimizer = TouchedAdam([field.density, field.features], lr=0.1)
-    used_bytes(field, optimizer)
-    budget = training_bytes(field.full_plan, None, Work(8, False))
-    refine(field, Work(8, False), budget, [(optimizer, field.density), (optimizer, field.features)])
-    assert not optimizer.state and 1.25 <= field.factor <= ROOM / share
-    assert 0.75 * ROOM * budget < used_bytes(field, optimizer) <= ROOM * budget
-    assert field.plan == field.full_plan.scaled(field.factor)
-
-
 @pytest.mark.parametrize(("share", "room"), [(0.25, 1.0), (0.5, 1.0), (1.0, 1.0), (1.0, 1.2), (0.25, 0.5), (0.25, 0.3)])
 def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(share, room):
     field = half_empty(64.0, share)
@@ -97,18 +65,3 @@ def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(shar
     plane, y, x = place // 64, place // 8 % 8, place % 8
     assert (copy.own_tiles[plane, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2] > 0).all(), "the brick of the largest gain"
     assert mpi.own_tiles[plane, y, x] == 0, "which the MPI gives up"
-
-
-def test_without_errors_nothing_is_copied():
-    field = half_empty(64.0, 0.25)
-    copy_finely(field, torch.zeros(field.num_bricks + 1), Work(8, False), 10**12, [])
-    assert not field.copied
-
-
-@pytest.mark.parametrize(
-    ("detail", "factor", "width", "copied"), [(12.0, 3.0, 64, True), (12.0, 4.5, 64, False), (64.0, 1.0, 9000, False)]
-)
-def test_copies_are_for_plans_whose_rays_could_train_them_and_whose_sides_stay_allowed(detail, factor, width, copied):
-    plan = ScenePlan((make_mpi(planes=4, height=8, width=width),), None, 0.05, 1.5, detail=detail)
-    assert plan.may_be_copied(factor) == copied
-    assert len(plan.largest.mpis) == (1 if width == 9000 else 2)

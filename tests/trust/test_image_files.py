@@ -6,8 +6,8 @@ import shutil
 
 import numpy as np
 import pytest
-from forked import run, train
-from PIL import ExifTags, Image
+from forked import train
+from PIL import Image
 from tiny_scene import HEIGHT, WIDTH, name_of
 
 
@@ -23,54 +23,18 @@ def one_rgba(data):
     save(data, 3, smooth(4))
 
 
-def one_gray(data):
-    save(data, 3, smooth(1)[..., 0])
-
-
 def one_palette(data):
     Image.fromarray(smooth(3)).convert("P").save(data / "images" / name_of(3))
-
-
-def one_cmyk(data):
-    path = data / "images" / name_of(3)
-    Image.fromarray(smooth(4), mode="CMYK").save(path.with_suffix(".jpg"))
-    path.with_suffix(".jpg").rename(path)
 
 
 def sixteen_bits(data):
     save(data, 3, np.full((HEIGHT, WIDTH), 40_000, np.uint16))
 
 
-@pytest.mark.parametrize("odd", [one_rgba, one_gray, one_palette, one_cmyk, sixteen_bits])
+@pytest.mark.parametrize("odd", [one_rgba, one_palette, sixteen_bits])
 def test_images_of_other_kinds_among_rgb_train(data, tmp_path, odd):
     odd(data)
     assert "Training finished" in train(data, tmp_path).shown
-
-
-@pytest.mark.parametrize("ending", [".webp", ".png"])
-def test_webp_images_are_matched_whatever_their_ending(data, edit, tmp_path, ending):
-    def rename(meta):
-        for key in ("train", "val", "test"):
-            del meta[f"{key}_filenames"]
-        for frame in meta["frames"]:
-            path = data / frame["file_path"]
-            image = Image.open(path).convert("RGB")
-            path.unlink()
-            image.save(path.with_suffix(ending), format="WEBP", lossless=True)
-            frame["file_path"] = str(path.with_suffix(ending).relative_to(data))
-
-    edit(rename)
-    shutil.rmtree(data / "colmap")
-    shown = train(data, tmp_path).shown
-    assert "triangulated points" in shown and "Training finished" in shown
-
-
-def test_16_bit_pixels_become_the_nearest_of_8_bits(data):
-    from training_runs import datamanager
-
-    sixteen_bits(data)
-    image = datamanager(data, test_mode="inference").train_dataset.get_data(2, image_type="uint8")["image"]
-    assert image.shape == (HEIGHT, WIDTH, 3) and (image == 40_000 // 257).all()
 
 
 def float_image(path):
@@ -80,10 +44,7 @@ def float_image(path):
 DAMAGED = {
     "missing": lambda p: p.unlink(),
     "cut short": lambda p: p.write_bytes(p.read_bytes()[:300]),
-    "empty": lambda p: p.write_bytes(b""),
     "no image": lambda p: p.write_bytes(b"hello"),
-    "a link to itself": lambda p: (p.unlink(), p.symlink_to(p)),
-    "a folder": lambda p: (p.unlink(), p.mkdir()),
     "of floats": float_image,
 }
 
@@ -96,7 +57,7 @@ def test_an_image_that_cannot_be_read_is_named(data, tmp_path, case, i):
     assert name_of(i) in said and "cannot be read" in said and "leave it out" in said
 
 
-@pytest.mark.parametrize("i", [3, 5])
+@pytest.mark.parametrize("i", [3])
 def test_an_image_of_another_size_is_named(data, tmp_path, i):
     shutil.rmtree(data / "colmap")
     save(data, i, np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8))
@@ -106,18 +67,8 @@ def test_an_image_of_another_size_is_named(data, tmp_path, i):
     assert "matching" not in ended.out  # which takes minutes
 
 
-@pytest.mark.parametrize(("orientation", "named"), [(6, True), (8, True), (3, False)])
-def test_an_image_that_its_exif_alone_turns_is_refused_with_the_reason(data, tmp_path, orientation, named):
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    Image.new("RGB", (HEIGHT, WIDTH)).save(data / "images" / name_of(3), exif=exif)
-    assert ("its EXIF alone turns it" in train(data, tmp_path).sentence) == named
-
-
 ARRAYS = {
-    "a row": np.zeros(7), "empty": np.zeros((0, 0)), "of three channels": np.zeros((HEIGHT, WIDTH, 3)),
-    "of objects": np.array([{"a": 1}], dtype=object), "of texts": np.full((HEIGHT, WIDTH), "a"),
-    "of complex numbers": np.full((HEIGHT, WIDTH), 1j),
+    "of three channels": np.zeros((HEIGHT, WIDTH, 3)), "of objects": np.array([{"a": 1}], dtype=object),
 }  # fmt: skip
 
 
@@ -142,14 +93,8 @@ def test_a_depth_image_that_cannot_be_used_is_named(data, edit, tmp_path, kind):
     assert kind != "missing" or "matching" not in ended.out  # which takes minutes
 
 
-@pytest.mark.parametrize("factor", [8, 0, -2])
+@pytest.mark.parametrize("factor", [8, 0])
 def test_downscaling_without_copies_says_which_there_are(data, tmp_path, factor):
     (data / "images_2").mkdir()
     said = train(data, tmp_path, pipeline__datamanager__dataparser__downscale_factor=factor).sentence
     assert "--downscale-factor" in said and (factor < 1 or "images_2" in said)
-
-
-@pytest.mark.parametrize("i", [3, 5])
-def test_mmpi_plan_reads_the_images_as_ns_train_does(data, tmp_path, i):
-    DAMAGED["cut short"](data / "images" / name_of(i))
-    assert name_of(i) in run("mmpi-plan", data, "--output", tmp_path / "plan").sentence

@@ -16,58 +16,27 @@ NAN, INF = math.nan, math.inf
 P, M, D = "pipeline__model__placement__", "pipeline__model__", "pipeline__datamanager__"
 
 REFUSED = {
-    "max_num_iterations": [-1],
-    "steps_per_save": [-1],
-    "steps_per_eval_batch": [-3],
-    "steps_per_eval_image": [-3],
-    "steps_per_eval_all_images": [-3],
-    "logging__steps_per_log": [0],
-    "machine__seed": [-1, 10**30],
-    "machine__num_devices": [0, 2],
-    D + "train_num_rays_per_batch": [0, -4],
-    D + "eval_num_rays_per_batch": [0],
-    D + "keypoint_rays": [-1],
-    D + "resident_pixels": [NAN, -1],
-    D + "camera_res_scale_factor": [0.0, NAN],
-    P + "texel_pixels": [NAN, 0.0, -1.0, INF],
-    P + "plane_pixels": [NAN, -1.0],
-    P + "max_mpis": [0, -1],
-    P + "max_planes": [0, 1, 10**6],
-    P + "max_texels": [NAN, -1],
-    P + "min_gain": [NAN],
-    P + "planes": [1],
-    P + "height": [0],
-    P + "width": [-5],
-    P + "window_length": [-1.0, NAN],
-    P + "faces": [(), ("up",)],
-    M + "colour__feature_channels": [0],
-    M + "colour__hidden_width": [0, -1],
-    M + "sampling__cube_alpha": [0.0, 2.0],
-    M + "sampling__threshold": [-1.0, NAN],
-    M + "rendering__threshold": [NAN],
-    M + "rendering__resident_gib": [-1.0],
-    M + "schedule__growth_shares": [(0.5, 2.0)],
-    M + "schedule__decay_decades": [NAN],
-    M + "schedule__decay_from": [1.5],
-    M + "loss__distortion": [NAN, -1.0],
-    "machine__device_type": ["mps"],
-}
-PARSER = {
-    "scale_factor": [0.0, NAN, -1.0],
-    "scene_scale": [NAN],
-    "train_split_fraction": [0.0, 2.0, NAN],
-    "eval_interval": [0, -8],
-    "depth_unit_scale_factor": [0.0, -1.0],
+    "max_num_iterations": -1,
+    "logging__steps_per_log": 0,
+    "machine__seed": 10**30,
+    "machine__num_devices": 2,
+    "machine__device_type": "mps",
+    D + "train_num_rays_per_batch": 0,
+    D + "resident_pixels": NAN,
+    P + "texel_pixels": INF,
+    P + "max_planes": 1,
+    P + "faces": ("up",),
+    M + "colour__hidden_width": -1,
+    M + "sampling__cube_alpha": 2.0,
+    M + "schedule__growth_shares": (0.5, 2.0),
+    M + "loss__distortion": NAN,
+    D + "dataparser__scale_factor": 0.0,
+    D + "dataparser__eval_interval": -8,
 }
 IGNORED = {
     D + "patch_size": 4,
-    D + "train_num_images_to_sample_from": 5,
-    D + "train_num_times_to_repeat_images": 5,
-    D + "eval_num_images_to_sample_from": 5,
-    D + "eval_image_indices": (1,),
     D + "images_on_gpu": True,
     M + "enable_collider": True,
-    M + "prompt": "a street",
 }
 
 
@@ -75,16 +44,11 @@ def option_of(name):
     return "--" + name.replace("__", ".").replace("_", "-")
 
 
-@pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in REFUSED.items() for v in values])
-def test_an_option_out_of_range_is_named(whole_scene, tmp_path, name, value):
-    assert option_of(name) in train(whole_scene, tmp_path / "out", **{name: value}).sentence
+@pytest.mark.parametrize("name", REFUSED)
+def test_an_option_out_of_range_is_named(whole_scene, tmp_path, name):
+    said = train(whole_scene, tmp_path / "out", **{name: REFUSED[name]}).sentence
+    assert option_of(name.split("dataparser__")[-1]) in said
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in PARSER.items() for v in values])
-def test_an_option_of_a_data_parser_out_of_range_is_named(whole_scene, tmp_path, name, value):
-    said = train(whole_scene, tmp_path, **{D + "dataparser__" + name: value}).sentence
-    assert said.startswith(option_of(name) + " must be")
 
 
 def test_a_method_of_the_paper_needs_a_number_of_steps():
@@ -95,31 +59,18 @@ def test_a_method_of_the_paper_needs_a_number_of_steps():
         check_run(config)
 
 
-def test_images_scaled_down_to_nothing_are_refused(whole_scene, tmp_path):
-    said = train(whole_scene, tmp_path, **{D + "camera_res_scale_factor": 0.01}).sentence
-    assert option_of(D + "camera_res_scale_factor") in said and "no pixel" in said
-
-
 @pytest.mark.parametrize("name", IGNORED)
 def test_an_option_that_would_be_ignored_is_refused(whole_scene, tmp_path, name):
     said = train(whole_scene, tmp_path / "out", **{name: IGNORED[name]}).sentence
     assert option_of(name) in said and "no effect" in said
 
 
-def test_shares_that_leave_nothing_for_the_first_phase_are_refused(whole_scene, tmp_path):
-    shares = {M + "schedule__blend_share": 0.6, M + "schedule__finetune_share": 0.4}
-    said = train(whole_scene, tmp_path, **shares, pipeline__model__schedule__training="two-phase").sentence
-    assert "blend-share" in said and "first phase" in said
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"experiment_name": "a" * 400}, ["--experiment-name", "too long"]),
-        ({"timestamp": "b" * 400}, ["--timestamp", "too long"]),
         ({"load_step": 3}, ["--load-step", "--load-dir"]),
         ({"mixed_precision": True}, ["--mixed-precision", "CPU"]),
-        ({"use_grad_scaler": True}, ["--use-grad-scaler", "CPU"]),
     ],
 )
 def test_options_that_say_nothing_together_are_refused(whole_scene, tmp_path, changes, words):
@@ -127,16 +78,9 @@ def test_options_that_say_nothing_together_are_refused(whole_scene, tmp_path, ch
     assert all(word in said for word in words), said
 
 
-@pytest.mark.parametrize(("name", "value"), [("--placement.texel-pixels", "nan"), ("--placement.max-mpis", "0")])
-def test_mmpi_plan_refuses_the_same_options(whole_scene, tmp_path, name, value):
-    ended = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", name, value)
-    assert name in ended.sentence
-
-
 OTHER_COMMANDS = [
     *(("mmpi-scene street {out}", option, value) for option, value in (
-        ("--width", "0"), ("--height", "-3"), ("--count", "0"), ("--length", "nan"), ("--points", "0"),
-        ("--seed", "-1"), ("--noise", "nan"), ("--outliers", "2"),
+        ("--width", "0"), ("--length", "nan"), ("--outliers", "2"),
     )),
     ("mmpi-bench score --images {out} --data {out}", "--test-images", "-1"),
 ]  # fmt: skip
@@ -147,13 +91,6 @@ def test_other_commands_name_the_option_that_cannot_be_used(tmp_path, command, o
     words = command.format(out=tmp_path / "out").split()
     assert run(*words, option, value).sentence.startswith(f"{option} must be")
     assert not (tmp_path / "out").exists()
-
-
-def test_mmpi_scene_names_a_folder_that_cannot_be_written_before_it_looks_for_points(tmp_path):
-    (tmp_path / "notes.txt").write_text("a file")
-    ended = run("mmpi-scene", "street", tmp_path / "notes.txt/street")
-    assert "notes.txt/street cannot be written" in ended.sentence and "choose another folder" in ended.sentence
-    assert "looking for points" not in ended.out
 
 
 def test_seeds_of_the_machine_are_those_of_our_draws(whole_scene, tmp_path):
@@ -175,11 +112,3 @@ def test_the_viewer_listens_on_this_machine_alone():
 
     for name in ("mmpi", "mmpi_small", "mmpi_kitti", "mmpi_scannet", "mmpi_scannet_short"):
         assert getattr(config, name).config.viewer.websocket_host == "127.0.0.1"
-
-
-def test_the_papers_settings_have_one_window_and_keep_their_bricks():
-    from mmpi_ns import config
-
-    for name in ("mmpi_kitti", "mmpi_scannet", "mmpi_scannet_short"):
-        model = getattr(config, name).config.pipeline.model
-        assert model.placement.window_length == 0 and model.schedule.release_weight == 0

@@ -26,84 +26,6 @@ def cube(**changes):
     return lambda plan: plan["cube"].update(changes)
 
 
-def top(**changes):
-    return lambda plan: plan.update(changes)
-
-
-REFUSED = {
-    **{
-        f"planes {v!r}": (mpi(planes=v), ["'mpi1'", "'planes'"]) for v in ("64", None, 64.5, True, 0, -3, 10_000, 10**9)
-    },
-    **{f"height {v!r}": (mpi(height=v), ["'mpi1'", "'height'"]) for v in ("64", None, 1, 10**6, [3])},
-    **{f"width {v!r}": (mpi(width=v), ["'mpi1'", "'width'"]) for v in (2.5, NAN, 10**400)},
-    **{f"near {v!r}": (mpi(near=v), ["'mpi1'", "'near'"]) for v in ("3 m", None, 0, -1, NAN, INF, 1e30)},
-    **{f"far {v!r}": (mpi(far=v), ["'mpi1'", "'far'"]) for v in ("3 m", 0, -1, NAN, 1e-9)},
-    "origin of two": (mpi(origin=[0, 1]), ["'mpi1'", "'origin'", "3 numbers"]),
-    "origin of texts": (mpi(origin=["0", "0", "0"]), ["'mpi1'", "'origin'"]),
-    "origin with NaN": (mpi(origin=[0, NAN, 0]), ["'mpi1'", "'origin'", "finite"]),
-    "origin is null": (mpi(origin=None), ["'mpi1'", "'origin'"]),
-    "axes of texts": (mpi(axes=[["1", "0", "0"]] * 3), ["'mpi1'", "'axes'"]),
-    "axes of two rows": (mpi(axes=[[1, 0, 0], [0, 1, 0]]), ["'mpi1'", "'axes'"]),
-    "axes is text": (mpi(axes="xyz"), ["'mpi1'", "'axes'"]),
-    "axes are not orthonormal": (mpi(axes=[[1, 0, 0], [0, 1, 0], [0, 1, 1]]), ["'mpi1'", "orthonormal"]),
-    "axes are left-handed": (mpi(axes=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), ["'mpi1'", "left-handed"]),
-    "extent of two": (mpi(extent=[0, 1]), ["'mpi1'", "'extent'"]),
-    "extent turned round": (mpi(extent=[1, -1, -1, 1]), ["'mpi1'", "u0 < u1"]),
-    "extent is infinite": (mpi(extent=[-INF, INF, -1, 1]), ["'mpi1'", "'extent'"]),
-    "name is a number": (mpi(name=3), ["MPI number 2", "name"]),
-    "name is empty": (mpi(name=""), ["MPI number 2", "name"]),
-    "an unknown field": (mpi(tilt=3), ["'mpi1'", "tilt"]),
-    "a field is missing": (lambda p: p["mpis"][1].pop("extent"), ["'mpi1'", "extent"]),
-    "an MPI is a number": (lambda p: p["mpis"].append(5), ["MPI number 3"]),
-    "no MPI": (top(mpis=[]), ["at least one MPI"]),
-    "mpis is no list": (top(mpis={}), ["'mpis' is not a list"]),
-    "mpis are missing": (lambda p: p.pop("mpis"), ["lacks ['mpis']"]),
-    "cube is text": (top(cube="none"), ["cube", "not a JSON object"]),
-    "cube shape of two": (cube(shape=[8, 8]), ["'shape'", "3 numbers"]),
-    "cube shape is huge": (cube(shape=[8, 8, 10**7]), ["'shape'"]),
-    "cube turned round": (cube(lower=[9, 9, 9]), ["'upper' > 'lower'"]),
-    "cube with NaN": (cube(upper=[NAN, 1, 1]), ["'upper'", "cube"]),
-    "ray_near is text": (top(ray_near="0"), ["'ray_near'"]),
-    "ray_near below 0": (top(ray_near=-1), ["'ray_near'"]),
-    "content_near is null": (top(content_near=None), ["'content_near'"]),
-    "origin_of_plan is a number": (top(origin_of_plan=1), ["'origin_of_plan'"]),
-    "detail below 1": (top(detail=0.5), ["'detail'"]),
-    "detail is text": (top(detail="2"), ["'detail'"]),
-    "windows is no list": (lambda p: (p.clear(), p.update(windows=3)), ["list 'windows'"]),
-    "no windows": (lambda p: (p.clear(), p.update(windows=[])), ["at least one window"]),
-    "a window is a number": (lambda p: (p.clear(), p.update(windows=[1])), ["Window 0"]),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_plan_that_cannot_be_used_is_refused(whole_scene, plan_text, tmp_path, case):
-    change, words = REFUSED[case]
-    plan = json.loads(plan_text)
-    change(plan)
-    path = tmp_path / "plan.json"
-    path.write_text(json.dumps(plan))
-    said = train(whole_scene, tmp_path, pipeline__model__plan_file=path).sentence
-    assert said.startswith(f"{path}: ") and all(word in said for word in words), said
-
-
-FILES = {
-    "empty": b"", "cut short": b'{"mpis": [', "a list": b"[]", "latin-1": '{"mpis": "Straße"}'.encode("latin-1"),
-    "deep": b"[" * 100_000, "a picture": b"\x89PNG\r\n\x1a\n",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", FILES)
-def test_a_file_that_is_no_plan_is_named(whole_scene, tmp_path, case):
-    path = tmp_path / "plan.json"
-    path.write_bytes(FILES[case])
-    assert str(path) in train(whole_scene, tmp_path, pipeline__model__plan_file=path).sentence
-
-
-def test_a_plan_that_is_not_there_is_named(whole_scene, tmp_path):
-    said = train(whole_scene, tmp_path, pipeline__model__plan_file=tmp_path / "no.json").sentence
-    assert "There is no scene plan at" in said and "--pipeline.model.plan-file" in said
-
-
 def test_a_plan_that_is_usable_trains(whole_scene, plan_text, tmp_path):
     path = tmp_path / "plan.json"
     path.write_text(plan_text)
@@ -129,22 +51,6 @@ def test_a_plan_that_needs_more_memory_than_there_is_is_refused_before_anything_
     path.write_text(json.dumps(plan))
     ended = train(whole_scene, tmp_path, memory=2 << 30, pipeline__model__plan_file=path)
     assert "GiB" in ended.sentence and "fewer texels" in ended.sentence
-
-
-@pytest.mark.parametrize("case", ["planes '64'", "axes of texts", "near nan", "an MPI is a number"])
-def test_mmpi_plan_refuses_the_same_plans(whole_scene, plan_text, tmp_path, case):
-    change, words = REFUSED[case]
-    plan = json.loads(plan_text)
-    change(plan)
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
-    said = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", "--plan-file", tmp_path / "plan.json").sentence
-    assert all(word in said for word in words), said
-
-
-def test_mmpi_plan_names_a_folder_that_it_cannot_write(whole_scene, tmp_path):
-    (tmp_path / "o").write_text("")
-    said = run("mmpi-plan", whole_scene, "--output", tmp_path / "o" / "p").sentence
-    assert "cannot be written" in said and "--output" in said
 
 
 def test_mmpi_plan_does_not_replace_a_plan_that_was_edited(whole_scene, tmp_path):

@@ -14,10 +14,6 @@ import pytest
 import torch
 import yaml
 from forked import run, start_train, train
-from tiny_scene import TEST, name_of, write_scene
-from training_runs import ready, trainer_config
-
-from mmpi_ns.training.trainer import MMPITrainer
 
 LONG = {"max_num_iterations": 100_000, "steps_per_save": 100_000}
 
@@ -93,23 +89,6 @@ def test_a_run_is_saved_where_those_who_read_its_output_went_too(whole_scene, tm
     assert len(list((folder_of(tmp_path) / "nerfstudio_models").iterdir())) == 1
 
 
-def test_a_run_that_is_stopped_before_it_trains_says_so(whole_scene, tmp_path):
-    running = start_train(whole_scene, tmp_path, **LONG)
-    running.wait_for("Reading")
-    running.send(signal.SIGINT)
-    ended = running.end()
-    assert ended.status == 130 and "Traceback" not in ended.out + ended.error
-    assert ended.error.strip().splitlines()[-1].startswith("Stopped")
-
-
-def test_a_run_that_is_stopped_after_its_last_step_says_how_its_details_are_made(scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(MMPITrainer, "_write_details", lambda *_: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(SystemExit) as ended:
-        ready(trainer_config(scene, None, tmp_path, 2)).train()
-    said = capsys.readouterr().err
-    assert ended.value.code == 130 and "Stopped after the last step, which is in" in said and "step-000000001" in said
-
-
 def test_details_that_a_stopped_run_lacks_are_made_when_it_goes_on(whole_scene, finished, tmp_path):
     shutil.rmtree(finished / "details")
     again = {"load_dir": finished / "nerfstudio_models", "max_num_iterations": 6}
@@ -117,15 +96,6 @@ def test_details_that_a_stopped_run_lacks_are_made_when_it_goes_on(whole_scene, 
     assert "already holds 6 of 6 steps: details of its training images are made" in said and "ns-eval" in said
     assert "no details" not in evaluate(finished, tmp_path).shown
     assert "nothing to do" in train(whole_scene, tmp_path, **again).shown
-
-
-def test_one_ctrl_c_closes_the_viewer_of_a_finished_run(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(MMPITrainer, "_train_complete_viewer", lambda _: signal.raise_signal(signal.SIGINT))
-    config = trainer_config(scene, None, tmp_path, 2)
-    config.viewer.quit_on_train_completion = False
-    with pytest.raises(SystemExit) as ended:
-        ready(config).train()
-    assert ended.value.code is None
 
 
 def test_a_stopped_run_goes_on_in_its_folder(whole_scene, tmp_path):
@@ -167,46 +137,7 @@ def test_a_new_run_into_the_folder_of_an_old_one_is_refused(whole_scene, finishe
     }
 
 
-def test_what_a_killed_run_left_half_written_is_cleared_away(whole_scene, tmp_path):
-    folder = folder_of(tmp_path)
-    (folder / "windows").mkdir(parents=True)
-    left = [folder / ".step-000000001.ckpt.77.tmp", folder / "windows" / ".window-00000.pt.77.tmp"]
-    for path in left:
-        path.write_bytes(b"half")
-    assert train(whole_scene, tmp_path).status == 0
-    assert not any(path.exists() for path in left)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_named(whole_scene, tmp_path):
-    tmp_path.chmod(0o555)
-    assert "cannot be written" in train(whole_scene, tmp_path).sentence
-
-
-def test_an_output_folder_that_is_a_file_is_named(whole_scene, tmp_path):
-    (tmp_path / "out").write_text("")
-    said = train(whole_scene, tmp_path / "out").sentence
-    assert "cannot be written" in said and "--output-dir" in said
-
-
 # Resuming ------------------------------------------------------------------------------------------------------------
-
-
-def test_another_capture_with_the_old_plan_is_refused(whole_scene, trained, tmp_path):
-    other = write_scene(tmp_path / "other")
-    meta = json.loads((other / "transforms.json").read_text())
-    meta["frames"][0]["transform_matrix"][0][3] -= 0.2
-    (other / "transforms.json").write_text(json.dumps(meta))
-    said = train(
-        other, tmp_path, load_dir=trained / "nerfstudio_models", pipeline__model__plan_file=trained / "plan.json"
-    ).sentence
-    assert str(whole_scene) in said and str(other) in said and "another capture" in said
-
-
-def test_the_same_capture_in_another_folder_goes_on(whole_scene, trained, tmp_path):
-    moved = shutil.copytree(whole_scene, tmp_path / "moved")
-    said = train(moved, tmp_path, load_dir=trained / "nerfstudio_models", max_num_iterations=6).shown
-    assert "nothing to do" in said
 
 
 def test_another_plan_is_refused_and_what_differs_is_named(whole_scene, trained, tmp_path):
@@ -221,11 +152,8 @@ def test_another_plan_is_refused_and_what_differs_is_named(whole_scene, trained,
 
 DAMAGED = {
     "cut short": lambda p: p.write_bytes(p.read_bytes()[:-500]),
-    "halved": lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]),
-    "empty": lambda p: p.write_bytes(b""),
     "text": lambda p: p.write_text("hello"),
     "another method's": lambda p: torch.save({"step": 5, "pipeline": {}, "optimizers": {}}, p),
-    "a list": lambda p: torch.save([1, 2], p),
 }
 
 
@@ -246,94 +174,7 @@ class Runs:
         return Path.touch, (self.path,)
 
 
-def test_no_checkpoint_is_said(whole_scene, finished, tmp_path):
-    (finished / "nerfstudio_models" / "step-000000005.ckpt").unlink()
-    assert "There is no checkpoint in" in evaluate(finished, tmp_path).sentence
-    assert "There is no checkpoint in" in train(whole_scene, tmp_path / "n", load_dir=finished).sentence
-    assert not (tmp_path / "n").exists()  # nothing was begun: matching may take minutes
-
-
-def test_a_step_that_is_not_there_is_said(whole_scene, trained, tmp_path):
-    said = train(whole_scene, tmp_path, load_dir=trained / "nerfstudio_models", load_step=3).sentence
-    assert "There is no step 3" in said and "[5]" in said
-
-
-STRAY = ("notes.txt", "step-9.ckpt.bak", ".DS_Store", "step-x.ckpt", "a folder")
-
-
-@pytest.fixture
-def littered(finished):
-    for name in STRAY:
-        path = finished / "nerfstudio_models" / name
-        path.mkdir() if name == "a folder" else path.write_text("hello")
-    return finished
-
-
-def test_a_run_that_was_resumed_from_a_step_can_be_evaluated(whole_scene, trained, tmp_path):
-    models = trained / "nerfstudio_models"
-    plan = trained / "plan.json"
-    resumed = train(
-        whole_scene, tmp_path, max_num_iterations=8, load_dir=models, load_step=5, pipeline__model__plan_file=plan
-    )
-    assert resumed.status == 0, resumed.error
-    assert evaluate(folder_of(tmp_path), tmp_path).status == 0
-    assert json.loads((tmp_path / "eval.json").read_text())["checkpoint"].endswith("step-000000007.ckpt")
-
-
-def test_a_plan_that_was_edited_in_the_folder_of_a_run_is_not_replaced(whole_scene, finished, tmp_path):
-    path = finished / "plan.json"
-    plan = json.loads(path.read_text())
-    plan["mpis"][0]["name"] = "moved by hand"
-    path.write_text(json.dumps(plan))
-    said = train(whole_scene, tmp_path, load_dir=finished / "nerfstudio_models", max_num_iterations=6).sentence
-    assert str(path) in said and "--pipeline.model.plan-file" in said
-    assert json.loads(path.read_text()) == plan
-
-
 # Evaluating ----------------------------------------------------------------------------------------------------------
-
-
-def test_evaluation_takes_the_plan_from_the_checkpoint_and_places_nothing(finished, tmp_path):
-    ended = evaluate(finished, tmp_path)
-    assert ended.status == 0 and "Triangulated" not in ended.out and "SfM" not in ended.out
-    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 5
-
-
-def test_evaluation_says_psnr_and_ssim_with_the_worst_and_the_best_image(finished, tmp_path):
-    said = evaluate(finished, tmp_path).shown
-    results = json.loads((tmp_path / "eval.json").read_text())["results"]
-    assert f"2 images: PSNR {results['psnr']:.2f} dB (worst" in said and f"SSIM {results['ssim']:.3f} (" in said
-    assert all(name_of(i) in said for i in TEST)
-
-
-@pytest.mark.parametrize(("option", "value"), [("--least", "nan"), ("--least", "-1"), ("--compare", "-3")])
-def test_mmpi_export_names_the_option_that_cannot_be_used(trained, tmp_path, option, value):
-    place = ("--load-config", trained / "config.yml", "--output", tmp_path / "out")
-    assert run("mmpi-export", "bake", *place, option, value).sentence.startswith(f"{option} must be")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("format", "name"), [("bake", "out"), ("splats", "out/scene.ply")])
-def test_mmpi_export_names_a_folder_that_cannot_be_written_before_it_bakes(trained, tmp_path, format, name):
-    (tmp_path / "notes.txt").write_text("a file")
-    place = ("--load-config", trained / "config.yml", "--output", tmp_path / "notes.txt" / name)
-    ended = run("mmpi-export", format, *place)
-    assert "notes.txt/out cannot be written" in ended.sentence and "choose another --output" in ended.sentence
-    assert "Loading" not in ended.out
-
-
-@pytest.mark.parametrize("text", ["", "hello", "a: [1,"])
-def test_mmpi_export_names_a_config_that_is_none(finished, text):
-    (finished / "config.yml").write_text(text)
-    assert (
-        "not a config.yml that ns-train wrote"
-        in run("mmpi-export", "bake", "--load-config", finished / "config.yml").sentence
-    )
-
-
-def test_a_checkpoint_file_that_is_not_there_is_said(whole_scene, tmp_path):
-    said = train(whole_scene, tmp_path, load_checkpoint=tmp_path / "no.ckpt").sentence
-    assert "There is no checkpoint at" in said and "--load-checkpoint" in said
 
 
 def test_a_checkpoint_cannot_run_code(whole_scene, finished, tmp_path):
@@ -341,19 +182,6 @@ def test_a_checkpoint_cannot_run_code(whole_scene, finished, tmp_path):
     torch.save(torch.load(path, weights_only=True) | {"scalers": Runs(tmp_path / "ran")}, path)
     assert str(path) in train(whole_scene, tmp_path / "new", load_dir=path.parent).sentence
     assert not (tmp_path / "ran").exists()
-
-
-def test_a_resumed_run_passes_over_stray_files_among_checkpoints(whole_scene, littered, tmp_path):
-    said = train(whole_scene, tmp_path / "new", load_dir=littered / "nerfstudio_models", max_num_iterations=6).shown
-    assert "nothing to do" in said
-
-
-def test_evaluation_of_a_capture_that_has_gone_is_one_sentence(whole_scene, tmp_path):
-    data = shutil.copytree(whole_scene, tmp_path / "gone")
-    assert train(data, tmp_path).status == 0
-    shutil.rmtree(data)
-    said = evaluate(folder_of(tmp_path), tmp_path).sentence
-    assert f"There is no {data / 'transforms.json'}: check --data" in said
 
 
 @pytest.mark.parametrize("command", ["ns-eval", "mmpi-export"])

@@ -10,7 +10,7 @@ import torch
 
 from mmpi_ns.scene.bricks import AT_ONCE, move_bricks
 from mmpi_ns.scene.texels import BRICK
-from mmpi_ns.utils.pages import FORGET, PART, advise, all_zero, empty_table, lazy_zeros
+from mmpi_ns.utils.pages import PART, all_zero
 
 CPU = torch.device("cpu")
 RESIDENT = """
@@ -30,24 +30,6 @@ def numbers_of(work: str) -> list[int]:
     """What a program prints, in a process of its own."""
     program = [sys.executable, "-c", RESIDENT + dedent(work)]
     return list(map(int, subprocess.run(program, capture_output=True, check=True).stdout.split()))
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.uint8])
-@pytest.mark.parametrize("make", [lazy_zeros, lambda *how: empty_table(*how).zero_()])
-@pytest.mark.parametrize("shape", [(0, 3), (1,), (700, 2, 9), (300_000, 8)])
-def test_an_array_of_zeros_is_like_any_other(make, shape, dtype):
-    array = make(shape, dtype, CPU)
-    assert array.shape == shape and array.dtype == dtype and array.is_contiguous() and not array.any()
-    array += 1
-    assert bool((array == 1).all())
-
-
-@pytest.mark.parametrize("start, stop", [(0, 1), (1, 5000), (3, 1_000_000), (999, 999), (0, 1_000_000)])
-def test_only_the_part_that_is_forgotten_loses_its_values(start, stop):
-    array = torch.arange(1, 1_000_001)
-    advise(array[start:stop], FORGET)
-    assert torch.equal(array[:start], torch.arange(1, start + 1))
-    assert torch.equal(array[stop:], torch.arange(stop + 1, 1_000_001))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.uint8])

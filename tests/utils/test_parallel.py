@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from threading import Thread
 
 import pytest
@@ -29,12 +28,6 @@ def test_torch_takes_one_thread_and_kernels_all(three_threads):
     assert (torch.get_num_threads(), parallel.num_threads()) == (3, 3)
 
 
-def test_a_failure_gives_the_threads_back(three_threads):
-    with pytest.raises(KeyError), parallel.torch_apart():
-        raise KeyError
-    assert torch.get_num_threads() == 3
-
-
 def test_a_thread_that_began_within_the_block_has_all_kernel_threads_too(three_threads):
     seen = []
 
@@ -48,23 +41,3 @@ def test_a_thread_that_began_within_the_block_has_all_kernel_threads_too(three_t
         beside.start()
         beside.join()
     assert seen == [3]
-
-
-def test_results_come_in_order_whatever_the_threads(three_threads):
-    with parallel.torch_apart():
-        assert list(parallel.in_order(lambda i: i * i, range(20))) == [i * i for i in range(20)]
-
-
-def test_a_few_tasks_are_started_ahead_of_the_results():
-    started = []
-
-    def tasks():
-        for i in range(6):
-            started.append(i)
-            future = Future()
-            future.set_result(i * i)
-            yield f"{i}", future
-
-    results = parallel.in_turn(tasks(), 2)
-    assert not started and next(results) == ("0", 0) and started == [0, 1, 2]
-    assert list(results) == [(f"{i}", i * i) for i in range(1, 6)]

@@ -4,90 +4,97 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-import oracle
 import pytest
 import torch
 from bricked import bricked_field
-from hand_made import make_mpi, random_mpi
+from hand_made import make_mpi
 from hard_rays import HARD_RAYS, hard_plan, hard_rays
 from interpreting import by_torch, interpreted, normal  # noqa: F401
-from random_fields import OracleRay, bundle, fill, random_field, random_rays, render, sampled
+from kernel_cases import CASES, CLOSE, Shapes, differences
+from random_fields import bundle, random_field, random_rays, render, sampled
 from random_scenes import dense_grad
+from shows import compare as compare_shown
+from shows import nothing_is_shown_of_nothing
 
 from mmpi_ns import blending
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops import composite
+from mmpi_ns.ops import composite, interpolate
+from mmpi_ns.ops.adam import AdamConstants, adam_rows
 from mmpi_ns.ops.interpolate import Table
-from mmpi_ns.ops.march import MarchOptions, gpu
-from mmpi_ns.sampler import march, rays_of
-from mmpi_ns.scene.plan import CubePlan, ScenePlan
-
-# Crossings -----------------------------------------------------------------------------------------------------------
+from mmpi_ns.ops.march import gpu
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.texels import BRICK
 
 
-@pytest.mark.parametrize("far", [math.inf, 6.0])
-def test_rays_cross_the_planes_that_the_oracle_has(far):
-    rng, checked, missed = np.random.default_rng(1), 0, 0
-    plan = ScenePlan((*(random_mpi(rng, f"{k}", deep=d) for k, d in enumerate((math.inf, 1.01, 8.0))),), None, 0.3, 1.0)
-    field = MMPIField(plan)
-    origins, directions = random_rays(plan, 60, seed=2)
-    m = march(field.layout, field.tables, rays_of(bundle(origins, directions, near=0.3, far=far)), MarchOptions(0.0))
-    assert torch.equal(m.live, m.valid.sum(1))
-    for i in range(60):
-        for k, mpi in enumerate(plan.mpis):
-            expected = oracle.crossings(mpi, origins[i], directions[i], 0.3, far)
-            if min(c.margin for c in expected) < 1e-5:
-                continue
-            live, checked = [c for c in expected if c.live], checked + 1
-            missed += not live
-            mine = m.valid[i] & (m.heads[i] == k)
-            assert m.planes[i][mine].tolist() == [c.plane for c in live]
-            (u0, u1, v0, v1), places = mpi.extent, m.ndc[i][mine].double().numpy()
-            for c, (u, v, _), inverse_t in zip(live, places, m.inverse_t[i][mine].tolist(), strict=True):
-                scaled = 2 * (c.u - u0) / (u1 - u0) - 1, 2 * (c.v - v0) / (v1 - v0) - 1
-                assert (u, v) == pytest.approx(scaled, abs=2e-5) and inverse_t == pytest.approx(c.inverse_t, rel=1e-4)
-    assert checked > 100 and missed > 10
+@pytest.mark.parametrize("shapes", [Shapes(), Shapes((1, 9), cube=False, channels=9)], ids=["2 MPIs", "1 and 9 MPIs"])
+@pytest.mark.parametrize("name", sorted(CASES.keys() - {"adam_rows", "march", "show_rays"}))
+def test_kernels_and_their_gradients_are_those_of_the_definitions(name, shapes):
+    found = differences(name, "cpu", shapes)
+    assert found and max(found) < CLOSE
 
 
-@pytest.mark.parametrize("near", [0.3, 2.53])
-def test_rays_meet_the_samples_of_the_cube_that_float64_has(near):
-    """Sample i lies at distance (i + 1/2) step; of those within the cube all are met."""
-    cube, rng = CubePlan((-1.0, -0.8, 1.5), (0.9, 1.1, 3.5), (6, 5, 4)), np.random.default_rng(3)
-    field = MMPIField(ScenePlan((make_mpi(planes=2),), cube, 0.05, 1.0), samples_per_voxel=4.0)
-    directions = rng.normal(size=(40, 3)) * [0.4, 0.4, 1] + [0, 0, 1]
-    directions[:4] = [[0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 0.1, 1]]  # along an axis: no bound within a slab
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = rng.normal(size=(40, 3)) * 0.3
-    m = march(field.layout, field.tables, rays_of(bundle(origins, directions, near=near)), MarchOptions(0.0))
-    step, checked = float(field.layout.cube.step), 0
-    for i in range(40):
-        t = (np.arange(400) + 0.5) * step
-        points = origins[i] + t[:, None] * directions[i]
-        depth = np.minimum(points - np.array(cube.lower), np.array(cube.upper) - points).min(1)
-        if min(np.abs(depth).min(), np.abs(t - near).min()) < 1e-5:
-            continue
-        inside, checked = (depth > 0) & (t > near), checked + 1
-        mine = m.valid[i] & (m.heads[i] == 1)
-        assert m.planes[i][mine].tolist() == inside.nonzero()[0].tolist()
-        assert m.inverse_t[i][mine].tolist() == pytest.approx(1 / t[inside], rel=1e-5)
-    assert checked > 30 and (m.heads[m.valid] == 1).sum() > 100
+# Rows ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cube", [True, False])
-def test_only_heads_that_may_answer_a_ray_do_and_it_is_explained_as_by_the_reference(cube):
-    """Heads by name, the MPI of highest priority, and both; one MPI ends, one is entered late, one reaches infinity."""
-    g = torch.Generator().manual_seed(1)
-    plan = random_field(3, cube, seed=3, planes=14).plan
-    plan = ScenePlan((*plan.mpis, make_mpi("ends", far=9.0, planes=7)), plan.cube, 0.05, 0.7)
-    field = fill(MMPIField(plan, feature_channels=5, hidden_width=6), 3)
-    rays, seen = bundle(*random_rays(plan, 60, seed=1)), set()
-    mask = torch.rand(60, plan.num_heads, generator=g) < 0.5
-    priorities = torch.rand(60, 4, generator=g)
-    for chosen in ({"head_mask": mask}, {"choose": priorities}, {"head_mask": mask, "choose": priorities}):
-        _, plain = compare(field, rays, 1e-3, **chosen)
-        seen |= set(plain.samples.explained.flatten().tolist())
-    assert seen == {True, False}
+@pytest.mark.parametrize(("channels", "taps"), [(1, 4), (9, 8)])
+def test_interpolation_and_its_gradient_are_those_of_float64(channels, taps):
+    g = torch.Generator().manual_seed(taps)
+    rows, weights = torch.randint(0, 40, (300, taps), generator=g), torch.rand(300, taps, generator=g)
+    table, exact = Table(normal(50, channels)), normal(50, channels).double().requires_grad_()
+    upstream = normal(300, channels, seed=2)
+    read = interpolate.interpolate(table, rows, weights)
+    wanted = interpolate.interpolate_densely(exact, rows, weights.double())
+    assert (read.double() - wanted).abs().max() < 2e-6
+    (read * upstream).sum().backward()
+    (wanted * upstream.double()).sum().backward()
+    assert (dense_grad(table).double() - exact.grad).abs().max() < 2e-5
+    assert exact.grad[40:].abs().max() == 0 < exact.grad.abs().max()
+
+
+@pytest.mark.parametrize("spread", ["side by side", "anywhere", "one"])
+@pytest.mark.parametrize("count", [1, 1500])
+def test_distinct_rows_are_those_of_the_reference(count, spread):
+    g, different, most = torch.Generator().manual_seed(count), 1 + count // 3, 2**17  # several programs of words
+    chosen = torch.randint(0, different, (count, 4), generator=g)
+    anywhere = torch.randint(0, most, (different,), generator=g)
+    anywhere[0] = most - 1
+    rows = {"side by side": chosen, "anywhere": anywhere[chosen], "one": chosen * 0}[spread]
+    found = interpolate.index_rows(rows, most)
+    assert torch.equal(found.unique, rows.unique())
+    assert found.positions.shape == rows.shape and torch.equal(found.unique[found.positions.long()], rows)
+
+
+def test_padded_rows_end_in_row_0_which_nothing_is_added_to():
+    rows = torch.tensor([[7, 3], [3, 90], [7, 7]])
+    found = interpolate.index_rows(rows, 100, pads=True)
+    assert found.unique.tolist() == [3, 7, 90, 0, 0, 0] and torch.equal(found.unique[found.positions.long()], rows)
+    table = Table(normal(100, 1))
+    interpolate.interpolate(table, rows, torch.ones(3, 2)).sum().backward()
+    assert torch.equal(dense_grad(table)[:, 0], torch.bincount(rows.reshape(-1), minlength=100).float())
+
+
+@pytest.mark.parametrize("pads", [False, True])
+def test_no_rows_are_no_distinct_rows(pads):
+    found = interpolate.index_rows(torch.zeros(0, 4, dtype=torch.int64), 9, pads)
+    assert found.unique.shape == (0,) and found.positions.shape == (0, 4)
+    assert interpolate.sum_rows(found.positions, torch.zeros(0, 3), torch.zeros(0, 4), 0).shape == (0, 3)
+
+
+@pytest.mark.parametrize("channels", [9])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
+def test_adam_on_rows_is_that_of_float64_and_leaves_the_rest_alone(channels, dtype):
+    rows = torch.cat([torch.arange(3), torch.arange(BRICK, 5 * BRICK, 3), torch.zeros(5, dtype=torch.int64)])
+    grad = normal(len(rows), channels, seed=1)
+    grad[::4] = 0
+    param, moments = normal(5 * BRICK, channels), normal(5 * BRICK, 2, channels, seed=2).abs().to(dtype)
+    constants = AdamConstants(0.9, 0.99, 0.3, 1e-8, 0.05)
+    wanted = param.double(), moments.double()
+    adam_rows.reference(*wanted, rows, grad.double(), constants)
+    before = param.clone()
+    adam_rows(param, moments, rows, grad, constants)
+    assert torch.allclose(param.double(), wanted[0], atol=1e-6)
+    assert torch.allclose(moments.double(), wanted[1], rtol=1e-2 if dtype == torch.bfloat16 else 1e-6)
+    assert torch.equal(param[:BRICK], before[:BRICK]) and not torch.equal(param, before)
 
 
 # March ---------------------------------------------------------------------------------------------------------------
@@ -136,38 +143,7 @@ def test_rays_pass_what_holds_nothing_like_the_reference():
     compare(field, bundle(*random_rays(field.plan, 40, seed=1)), 1e-3, True)
 
 
-def test_nine_heads_and_several_programs_march_like_the_reference(monkeypatch):
-    monkeypatch.setattr(gpu, "block_size", lambda wanted, device: 16)
-    field = random_field(9, False, seed=9, planes=10)
-    compare(field, bundle(*random_rays(field.plan, 37, seed=1)), 1e-3)
-
-
-def test_a_fair_share_keeps_what_a_threshold_alone_would_drop():
-    field = MMPIField(ScenePlan((make_mpi(planes=40),), None, 0.05, 1.0)).eval()  # all weights are 1/40
-    rays = bundle([[0, 0, 0]], [[0, 0, 1]])
-    assert compare(field, rays, 0.1)[0].samples.valid.sum() == 0
-    assert compare(field, rays, 0.1, fair_share=0.1)[0].samples.valid.sum() == 40
-
-
-def test_rays_render_as_the_oracle_has_them():
-    field = random_field(3, True, seed=5, planes=10)
-    origins, directions = random_rays(field.plan, 30, seed=6)
-    for blends in (True, False):
-        fast, checked = render(field, bundle(origins, directions), blends=blends), 0
-        for i in range(30):
-            exact = OracleRay(field, origins[i], directions[i])
-            if exact.margin < 1e-5:
-                continue
-            wanted, checked = exact.render(blends), checked + 1
-            assert int(fast.samples.valid[i].sum()) == len(wanted.samples)
-            assert np.abs(fast.rgb[i].double().numpy() - wanted.color).max() < 5e-5
-            weights = fast.composite.weights[i, : len(wanted.samples)].double().numpy()
-            assert np.abs(weights - wanted.weights).max() < 5e-5
-            assert fast.composite.transmittance[i].item() == pytest.approx(wanted.transmittance, abs=5e-5)
-        assert checked > 15
-
-
-@pytest.mark.parametrize("raw", [0.0, 1e4, -1e4])
+@pytest.mark.parametrize("raw", [0.0, 1e4])
 def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monkeypatch, raw):
     """Two MPIs coincide, so that every distance is a tie; raw densities make alpha 1 or 0."""
     monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)
@@ -234,11 +210,23 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
         assert size > 1e-3 and (fast[name] - plain[name]).abs().max() < 2e-4 * size, name
 
 
-# The whole -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("blends", [True, False])
+def test_pictures_show_what_the_reference_says(monkeypatch, blends):
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    field = random_field(3, True, seed=3, planes=14)
+    wanted = compare_shown(field, bundle(*random_rays(field.plan, 20, seed=1)), 1e-2, blends)
+    assert len(wanted.winner.unique()) > 2 and wanted.gathered.abs().amax(0).min() > 0.05
+    assert (wanted.dropped_mass > 1e-3).any()
 
 
-def test_a_field_of_trained_and_untrained_texels_blends_like_the_reference(monkeypatch):
-    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)
-    field = fill(MMPIField(random_field(3, True, seed=11).plan, feature_channels=5, hidden_width=6), 11)
-    field.touched.copy_(torch.rand(len(field.touched), generator=torch.Generator().manual_seed(1)) < 0.5)
-    compare(field, bundle(*random_rays(field.plan, 40, seed=2)), 1e-3, True)
+def test_thin_scenes_with_gaps_show_what_the_reference_says(monkeypatch):
+    monkeypatch.setattr(gpu, "block_size", lambda wanted, device: 16)  # two programs, of different lengths
+    field = bricked_field(0.4)
+    rays = bundle(*random_rays(field.plan, 19, seed=1))
+    wanted = compare_shown(field, rays, 1e-3)
+    assert (wanted.transmittance > 0.1).any()
+    compare_shown(field, rays, 1e-3, True)
+
+
+def test_rays_that_meet_nothing_and_no_rays_show_nothing():
+    nothing_is_shown_of_nothing()
