@@ -135,8 +135,8 @@ def test_windows_open_at_a_training_image_look_round_in_place_and_find_back(tmp_
         monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=look))  # in its endless loop
         with pytest.raises(KeyboardInterrupt):
             run_viewer.RunViewer(config.get_base_dir() / "config.yml").main()
-    for viewer in (trainer.viewer_state, *viewers):
-        for machine in [*viewer.render_statemachines.values()]:
-            machine.running = False
-            machine.join()  # a thread that renders when Python ends aborts it
-        viewer.viser_server.stop()
+        for viewer in (trainer.viewer_state, *viewers):
+            for machine in [*viewer.render_statemachines.values()]:
+                machine.running = False
+                machine.join()  # a thread that renders when Python ends aborts it
+            viewer.viser_server.stop()
