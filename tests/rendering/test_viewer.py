@@ -84,7 +84,7 @@ class Window:
 
 
 def wait_until(true):
-    end = time.monotonic() + 60
+    end = time.monotonic() + 180
     while not true():
         assert time.monotonic() < end
         time.sleep(0.2)
