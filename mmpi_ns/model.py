@@ -276,7 +276,7 @@ class MMPIModel(Model):
         if obb_box is not None:
             return super().get_outputs_for_camera(camera, obb_box)
         outputs = self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))
-        if current_thread() is not main_thread():  # the viewer's
+        if current_thread() is not main_thread() and self.show.value == "all":  # the viewer's
             self.path_controls.note(float((outputs["accumulation"] > 0.5).float().mean()))
         return outputs
 
