@@ -18,9 +18,9 @@ from mmpi_ns.placement.defaults import PLACEMENT, RAYS
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.rendering.pipeline import MMPIPipelineConfig
 from mmpi_ns.rendering.rendered import RenderingConfig
-from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import ScheduleConfig
+from mmpi_ns.training.run import PhaseSchedulerConfig
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
 from mmpi_ns.training.trainer import MMPITrainerConfig
 from mmpi_priors.settings import CapturePriorsConfig

@@ -27,11 +27,11 @@ from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
-from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
 from mmpi_ns.rendering.metrics import ImageMetrics, pictures, psnr_and_ssim
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
+    Exposures,
     RenderingConfig,
     background_of,
     bounded,

@@ -2,7 +2,6 @@
 
 nerfstudio's viewer opens beside a scene and looks at it. MPIs show a scene from within, near the captured path. The
 element uses the viewer's two hooks: ``install``, where controls are made, and ``_setup``, where the viewer is given.
-The training cameras are hidden at first: from where one of them stands, its own picture covers the view.
 """
 
 from __future__ import annotations
@@ -26,18 +25,25 @@ START = 1 / 6
 LITTLE = 1 / 3
 """Share of an image that is opaque, below which the way back to the path is offered."""
 CAMERAS_PER_SECOND = 4.0
-"""Pace of Play."""
+"""Fastest pace of Play, which goes the first content's distance in a second."""
+AHEAD = 0.01
+"""From the eye to the point that a drag turns about, in distances of the first content: one looks round in place."""
+NEAREST = 0.02
+"""Scene units; the page moves no nearer than half of it to that point."""
+PACE = 2.0
+"""Distances of the first content that the wheel walks while the page would divide the distance ahead by e."""
+TARGET = 10
+"""Frames a second for which the viewer chooses the size of images while one moves (its own: 30, a blur on a CPU)."""
 FRAMES_PER_SECOND = 10.0
 """Poses that Play sends."""
-NEAREST_TARGET = 0.11 / VISER_NERFSTUDIO_SCALE_RATIO
-"""From the eye to the nearest point that a drag may turn about, scene units: viser keeps 0.1 of its own."""
 
 
 class View(NamedTuple):
-    """Where a window stands and looks. World axes, scene units."""
+    """Where a window stands, looks, and what is up there. World axes; position in scene units, unit directions."""
 
     position: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
+    up: Float[np.ndarray, "3"]
 
 
 class CapturedPath:
@@ -45,10 +51,7 @@ class CapturedPath:
 
     def __init__(self, camera_to_worlds: Float[np.ndarray, "num_cameras 3 4"]) -> None:
         poses = np.asarray(camera_to_worlds, np.float64)
-        self.positions, self.directions = poses[:, :, 3], -poses[:, :, 2]
-        up = poses[:, :, 1].mean(0)
-        self.up = up / np.linalg.norm(up)
-        """The cameras' mean up: a horizon that is level, also where a single camera was tilted."""
+        self.positions, self.directions, self.ups = poses[:, :, 3], -poses[:, :, 2], poses[:, :, 1]
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -66,7 +69,11 @@ class CapturedPath:
             [-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, -(t**2) + t**3]
         )
         direction = weights @ self.directions[around]
-        return View(weights @ self.positions[around], direction / np.linalg.norm(direction))
+        direction /= np.linalg.norm(direction)
+        own, up = self.ups[round(place)], self.ups.mean(0)  # a level horizon, also where one camera was tilted
+        if up @ own < 0.7 * np.linalg.norm(up) or np.linalg.norm(up) < 1e-3:  # cameras that look straight down
+            up = own
+        return View(weights @ self.positions[around], direction, up / np.linalg.norm(up))
 
     def nearest(self, position: Float[np.ndarray, "3"]) -> int:
         """The camera nearest to a place."""
@@ -88,72 +95,74 @@ class PathControls(ViewerElement[float], ViewerControl):
         super().__init__("Captured path", cb_hook=lambda _: None)
         self._path: CapturedPath | None = None
         self._walker: ClientHandle | None = None
-        self._aspects: dict[int, float] = {}
-        """Width / height that each client's field of view fits."""
+        self._little = False
 
     def install(self, viser_server: ViserServer) -> None:
         """Makes the controls; the viewer calls it inside the model's folder."""
         gui = viser_server.gui
         self.gui_handle = self._slider = gui.add_slider("Captured path", 0.0, 1.0, 0.001, START)
         self._play = gui.add_checkbox("Play", False)
-        self._nearest = gui.add_button("Nearest camera")
-        self._line = gui.add_markdown("Little was captured from here: back to the path", visible=False)
-        self._back = gui.add_button("Back to the path", visible=False)
+        nearest = gui.add_button("Nearest camera")
         self._slider.on_update(self._walk)
         self._play.on_update(self._start_playing)
-        for button in (self._nearest, self._back):
-            button.on_click(self._go_to_nearest)
-
-    def remove(self) -> None:
-        """Takes the controls away."""
-        for handle in (self._slider, self._play, self._nearest, self._line, self._back):
-            handle.remove()
+        nearest.on_click(self._go_to_nearest)
 
     def _setup(self, viewer: Viewer) -> None:
         """Is given the viewer, when all controls are made."""
         super()._setup(viewer)
         cameras: Cameras = viewer.pipeline.datamanager.train_dataset.cameras  # type: ignore[union-attr]
-        self._path = CapturedPath(cameras.camera_to_worlds.cpu().numpy())
-        self._slider.value = round(self._path.start / max(len(self._path) - 1, 1), 3)
-        camera = cameras[self._path.start]
-        self._half_width = float(min(camera.cx, camera.width - camera.cx) / camera.fx)
-        self._half_height = float(min(camera.cy, camera.height - camera.cy) / camera.fy)
-        content_near = viewer.pipeline.model.progress.windows.plans[0].content_near  # type: ignore[union-attr]
-        self._ahead = max(0.01 * content_near, NEAREST_TARGET)
-        """From the eye to the point that a drag turns about, scene units: small, so that one looks round in place."""
+        path = CapturedPath(cameras.camera_to_worlds.cpu().numpy())
+        i = path.start
+        self._half_width = float(cameras.cx[i] / cameras.fx[i])
+        self._half_height = float(cameras.cy[i] / cameras.fy[i])
+        self._near: float = viewer.pipeline.model.progress.windows.plans[0].content_near  # type: ignore[union-attr]
+        self._ahead = max(AHEAD * self._near, NEAREST)
+        # Above the tabs, where nothing is scrolled away.
+        gui = viewer.viser_server.gui
+        self._line = gui.add_markdown("Little was captured from here:", order=-2, visible=False)
+        self._back = gui.add_button("Back to the path", order=-1, visible=False)
+        self._back.on_click(self._go_to_nearest)
+        # Whoever stands where a camera stood has its frustum, with a small copy of its image, before the eye.
+        frusta = viewer.viser_server.scene.add_frame("/cameras", show_axes=False, visible=False)
+        viewer.toggle_cameravis_button()
+        viewer.show_images.on_click(lambda _: setattr(frusta, "visible", True))
+        self._path, self._slider.value = path, i / max(len(path) - 1, 1)
         viewer.viser_server.on_client_connect(self._open)
-        Thread(target=self._hide_cameras, daemon=True).start()
-
-    def _hide_cameras(self) -> None:
-        """As "Hide Train Cams" does, when all are there: the viewer draws them after it has called its hooks."""
-        while not hasattr(self.viewer, "train_state"):
-            time.sleep(0.05)
-        self.viewer.set_camera_visibility(False)
-        self.viewer.toggle_cameravis_button()
 
     def note(self, opaque: float) -> None:
-        """Is told the opaque share of an image that was shown."""
-        if self._path is not None:
-            for handle in (self._line, self._back):
-                if handle.visible != (opaque < LITTLE):
-                    handle.visible = opaque < LITTLE
+        """Is told the opaque share of an image that was shown, by the viewer's thread."""
+        if self._path is not None and self._little != (opaque < LITTLE):
+            # The viewer stops its own thread anywhere, also between two halves of a change.
+            Thread(target=self._offer, args=[opaque < LITTLE], daemon=True).start()
+
+    def _offer(self, little: bool) -> None:
+        self._little = self._line.visible = self._back.visible = little
 
     def _open(self, client: ClientHandle) -> None:
         assert self._path is not None
-        client.camera.on_update(self._fit)
-        self._fit(client.camera)
+        self.viewer.render_statemachines[client.client_id].target_fps = TARGET
+        aspect, walked = 0.0, 0.0
+
+        def follow(camera: CameraHandle) -> None:
+            nonlocal aspect, walked
+            if camera.aspect != aspect:  # a page tells its size only when it is laid out
+                aspect = camera.aspect
+                camera.fov = fitting_fov(self._half_width, self._half_height, aspect)
+            ahead = (camera.look_at - camera.position) / VISER_NERFSTUDIO_SCALE_RATIO
+            nearer = float(np.log(self._ahead / np.linalg.norm(ahead)))  # by the wheel
+            # Of messages that were on their way when a window was moved, none moves it again.
+            if 0.01 < abs(nearer) < 0.7 and time.monotonic() - walked > 0.1:
+                walked, direction = time.monotonic(), ahead / np.linalg.norm(ahead)
+                position = camera.position / VISER_NERFSTUDIO_SCALE_RATIO + PACE * self._near * nearer * direction
+                self._show(camera, View(position, direction, camera.up_direction))
+
+        follow(client.camera)
+        client.camera.on_update(follow)
         self._show(client.camera, self._path.at(self._path.start))
 
-    def _fit(self, camera: CameraHandle) -> None:
-        """Fits the field of view to a window of a new shape; pages change their shape while they load."""
-        if self._aspects.get(camera.client.client_id) != camera.aspect:
-            self._aspects[camera.client.client_id] = camera.aspect
-            camera.fov = fitting_fov(self._half_width, self._half_height, camera.aspect)
-
     def _show(self, camera: CameraHandle, view: View) -> None:
-        assert self._path is not None
         with camera.client.atomic():
-            camera.up_direction = self._path.up
+            camera.up_direction = view.up
             camera.position = view.position * VISER_NERFSTUDIO_SCALE_RATIO
             camera.look_at = (view.position + self._ahead * view.direction) * VISER_NERFSTUDIO_SCALE_RATIO
 
@@ -164,8 +173,9 @@ class PathControls(ViewerElement[float], ViewerControl):
 
     def _go_to_nearest(self, event: Any) -> None:
         if self._path is not None and event.client is not None:
-            camera = event.client.camera
-            self._show(camera, self._path.at(self._path.nearest(camera.position / VISER_NERFSTUDIO_SCALE_RATIO)))
+            i = self._path.nearest(event.client.camera.position / VISER_NERFSTUDIO_SCALE_RATIO)
+            self._show(event.client.camera, self._path.at(i))
+            self._slider.value = i / max(len(self._path) - 1, 1)  # Play goes on from there
 
     def _start_playing(self, event: Any) -> None:
         if self._play.value and event.client is not None:
@@ -175,11 +185,12 @@ class PathControls(ViewerElement[float], ViewerControl):
     def _keep_playing(self, client: ClientHandle) -> None:
         """Walks on until Play is off, the window is closed, or the path ends."""
         assert self._path is not None
-        step = CAMERAS_PER_SECOND / FRAMES_PER_SECOND / max(len(self._path) - 1, 1)
-        place = self._slider.value if self._slider.value < 1 else 0.0
-        while self._play.value and client.client_id in self.viser_server.get_clients() and place < 1:
-            place = min(place + step, 1.0)
-            self._slider.value = place
+        length = float(np.linalg.norm(np.diff(self._path.positions, axis=0), axis=-1).sum())
+        pace = min(self._near / max(length, 1e-6), CAMERAS_PER_SECOND / max(len(self._path) - 1, 1))
+        if self._slider.value >= 1:
+            self._slider.value = 0.0
+        while self._play.value and client.client_id in self.viser_server.get_clients() and self._slider.value < 1:
+            self._slider.value = min(self._slider.value + pace / FRAMES_PER_SECOND, 1.0)
             time.sleep(1 / FRAMES_PER_SECOND)
         self._walker = None
         self._play.value = False

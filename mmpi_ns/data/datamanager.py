@@ -6,12 +6,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -20,7 +18,6 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
-from torch import Tensor
 
 from mmpi_ns.data.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.data.copies import fit_cameras
@@ -36,7 +33,6 @@ from mmpi_ns.utils.random_draws import Generators, generator
 from mmpi_ns.utils.values import check_options
 
 Batch = tuple[TrainingRays, dict[str, Any]]
-Parser = Literal["auto", "nerfstudio", "colmap"]
 CAPTURE = "capture"
 """Key of the ``Capture`` in the data set's metadata, by which nerfstudio hands it to the model."""
 MANY_DEPTHS = 0.4
@@ -135,12 +131,12 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         device = self.device
         generate = CameraRays.of(dataset.cameras, device) or RayGenerator(dataset.cameras.to(device))
         self.train_ray_generator: Any = lambda pixels: generate(pixels.to(device))
-        self._maker = self.config.priors.setup(
+        self.maker = self.config.priors.setup(
             outputs=self.train_dataparser_outputs, dataset=dataset, parser=self._parser,
             rays=self.train_ray_generator, seed=self.config.seed,
         )  # fmt: skip
         if self.test_mode == "val":
-            self.priors = priors = self._maker.make()
+            self.priors = priors = self.maker.make()
             share = 0.0 if priors.depths is None else priors.depths.share
             dataset.metadata[CAPTURE] = Capture(
                 priors.placement, TrainingViews.of(dataset.cameras), self.config.train_num_rays_per_batch,
@@ -154,7 +150,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     @cached_property
     def observations(self) -> Observations:
         """Observations of the training cameras. Only training searches the images, later perhaps absent, for points."""
-        return self._maker.observe(find_points=False) if self.priors is None else self.priors.observations
+        return self.maker.observe(find_points=False) if self.priors is None else self.priors.observations
 
     @property
     def _downscale_factor(self) -> int | None:
@@ -182,17 +178,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if self._pixels.sum() <= self.config.resident_pixels and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
-
-    def exposure_of(
-        self,
-        factors: Float[Tensor, "M 3"],
-        falloff: Float[Tensor, "2 3"],
-        camera: Cameras,
-        observed: Float[Tensor, "H W 3"],
-        outputs: dict[str, Tensor],
-    ) -> Float[Tensor, "3"] | None:
-        """Exposure of an evaluated image, by what training images near it show (``PriorsMaker.exposure_of``)."""
-        return self._maker.exposure_of(self.observations, factors, falloff, camera, observed, outputs)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
         """Draws from these training cameras from now on, None for all, and prints the share of each source. Raises

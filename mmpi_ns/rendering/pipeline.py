@@ -121,7 +121,7 @@ class MMPIPipeline(VanillaPipeline):
             return outputs
         manager: Any = self.datamanager
         exposures = model.exposures.factors, model.exposures.falloff
-        exposure = manager.exposure_of(*exposures, camera, observed, outputs)
+        exposure = manager.maker.exposure_of(manager.observations, *exposures, camera, observed, outputs)
         if exposure is None:
             say("No training image shows what an evaluated one does, or they are gone: it is scored at mean exposure.")
             return outputs

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle
@@ -12,6 +13,7 @@ from nerfstudio.model_components import renderers
 from torch import Tensor
 
 from mmpi_ns.blending import blended_optical_depth
+from mmpi_ns.data.priors import Gains
 from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import RayShader
@@ -46,6 +48,36 @@ class RenderingConfig:
     resident_gib: float = 2.0
     """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
     fit are kept, at least one; the least recently used is evicted first."""
+
+
+class Exposures(torch.nn.Module):
+    """Colours of each training image over those of the field; empty where all have the same exposure.
+
+    Args:
+        gains: of the training images, if they differ.
+    """
+
+    factors: Float[Tensor, "N 3"]
+    falloff: Float[Tensor, "2 3"]
+
+    def __init__(self, gains: Gains | None) -> None:
+        super().__init__()
+        factors, falloff = (np.zeros((0, 3)), np.zeros((2, 3))) if gains is None else (gains.from_field, gains.falloff)
+        self.register_buffer("factors", torch.from_numpy(factors).float())
+        self.register_buffer("falloff", torch.from_numpy(falloff).float())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Takes the number of images from the checkpoint; what a dictionary lacks stays, as where nerfstudio loads the
+        rest of a pipeline after its model."""
+        state_dict.setdefault(f"{prefix}falloff", self.falloff)
+        stored = state_dict.setdefault(f"{prefix}factors", self.factors)
+        self.factors = torch.empty_like(stored, device=self.factors.device)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    @property
+    def mean(self) -> Float[Tensor, "3"] | None:
+        """Mean exposure of the training images; None where all have the field's."""
+        return self.factors.log().mean(0).exp() if len(self.factors) else None
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def _mark(plan: Path) -> str:
 
 
 def load_observations(
-    data: Path, downscale_factor: int | None = None, parser: Parser = "auto", search: bool = True
+    data: Path, downscale_factor: int | None = None, parser: Parser = "auto"
 ) -> tuple[Observations, MMPIDataManager]:
     """The observations that training on a scene would use for placement, and the data manager. Raises InputError if the
     folder holds no scene, or one that cannot be trained.
@@ -121,7 +121,6 @@ def load_observations(
         data: the scene's folder.
         downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
-        search: for movers and depths of pixels, which takes minutes; without it tracks or searched surfaces alone.
     """
     # Slow imports, which --help does not need.
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -141,8 +140,6 @@ def load_observations(
     config.dataparser.downscale_factor = downscale_factor
     # As ns-train does, so that it refuses what ns-train would refuse, and finds the depths that it would find.
     config.priors = replace(config.priors, correct_exposure=False)  # placement does not ask for it
-    if not search:
-        config.priors = replace(config.priors, mask_moving=False, dense_depth=False, depth_images=False)
     config.new_view_share = 0.0
     manager = config.setup(device="cpu", test_mode="inference")
     if not any(Path(file).is_file() for file in manager.train_dataset.image_filenames):

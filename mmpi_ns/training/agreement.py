@@ -32,14 +32,7 @@ def disagreement(field: MMPIField, bundle: RayBundle, options: MarchOptions) -> 
     for route in ("auto", "torch"):
         with dispatch.chosen(route), torch.enable_grad():
             results[route] = _values_and_gradients(field, bundle, options)
-    compiled, reference = results["auto"], results["torch"]
-    wrong = []
-    for name, (rows, values) in reference.items():
-        theirs, ours = on_same_rows((rows, values), compiled[name])
-        difference = float((ours - theirs).norm() / theirs.norm().clamp(min=1e-12))
-        if not difference <= CLOSE:  # NaN too
-            wrong.append(f"{name} by {difference:.1%}")
-    return ", ".join(wrong)
+    return ", ".join(differences(results["torch"], results["auto"]))
 
 
 Rows = tuple[Int[Tensor, "U"], Float[Tensor, "U C"]]
@@ -51,17 +44,36 @@ def _values_and_gradients(field: MMPIField, bundle: RayBundle, options: MarchOpt
     values = torch.cat([rays.rgb, rays.composite.accumulation], -1)
     slopes = torch.linspace(-1, 1, values.numel(), device=values.device).view_as(values)
     (values * slopes).sum().backward()
-    found: dict[str, Rows] = {"colours": (torch.arange(len(values), device=values.device), values.detach().double())}
+    colors = torch.arange(len(values), device=values.device), values.detach().double()
+    gradients = gradients_of(field)
+    for parameter in field.parameters():
+        parameter.grad = None
+    return {"colours": colors, **gradients}
+
+
+def gradients_of(field: MMPIField) -> dict[str, Rows]:
+    """Copies of a field's gradients, by rows."""
+    gradients = {}
     for name, parameter in field.named_parameters():
         gradient, rows = parameter.grad, parameter.grad_rows if isinstance(parameter, Table) else None
         if gradient is not None:
-            rows = torch.arange(len(gradient), device=values.device) if rows is None else rows.long()
-            found[f"gradients of {name}"] = rows, gradient.detach().double().flatten(1)
-        parameter.grad = None
-    return found
+            rows = torch.arange(len(gradient), device=gradient.device) if rows is None else rows.long().clone()
+            gradients[f"gradients of {name}"] = rows, gradient.detach().double().flatten(1)
+    return gradients
 
 
-def on_same_rows(first: Rows, second: Rows) -> tuple[Tensor, Tensor]:
+def differences(reference: dict[str, Rows], others: dict[str, Rows]) -> list[str]:
+    """Which values differ by more than ``CLOSE``, and by how much, in words."""
+    wrong = []
+    for name, rows in reference.items():
+        first, second = _on_same_rows(rows, others[name])
+        difference = float((first - second).norm() / first.norm().clamp(min=1e-12))
+        if not difference <= CLOSE:  # NaN too
+            wrong.append(f"{name} by {difference:.1%}")
+    return wrong
+
+
+def _on_same_rows(first: Rows, second: Rows) -> tuple[Tensor, Tensor]:
     """Values of the rows of either, 0 where one has none."""
     rows = torch.cat([first[0], second[0]]).unique()
     parts = []

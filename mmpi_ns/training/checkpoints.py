@@ -27,7 +27,7 @@ from mmpi_ns.utils.files import to_text, write_atomically, write_errors
 from mmpi_ns.utils.pages import all_zero
 from mmpi_ns.utils.values import shown
 
-HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "capture"}
+HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "rays", "capture"}
 """Keys of every checkpoint of this method."""
 PLAN_FILE = "plan.json"
 _held: dict[Path, FileLock] = {}
@@ -47,11 +47,10 @@ def write_plan(path: Path, plan: WindowedPlan) -> None:
     digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
 
 
-def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
-    """The checkpoints in a folder by their steps, all or those of some steps."""
+def checkpoints_in(folder: Path) -> dict[int, Path]:
+    """The checkpoints in a folder by their steps."""
     named = ((re.fullmatch(r"step-(\d+)\.ckpt", path.name), path) for path in folder.glob("step-*.ckpt"))
-    numbered = ((int(name[1]), path) for name, path in named if name and path.is_file())
-    return {step: path for step, path in numbered if steps is None or step in steps}
+    return {int(name[1]): path for name, path in named if name and path.is_file()}
 
 
 def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
@@ -157,7 +156,7 @@ def check_same_run(
 ) -> None:
     """Raises InputError if a run of this capture, its training cameras, plan and mode of the camera optimiser cannot
     resume from a checkpoint, read from ``path``. ``rays``: of a step; None if they do not follow the device."""
-    drawn = state.get("rays", rays)  # earlier versions drew as many on all devices
+    drawn = state["rays"]
     if rays is not None and drawn != rays:
         steps = Schedule.from_json(to_text(state["pipeline"]["_model.progress.schedule_bytes"])).window_steps
         raise InputError(

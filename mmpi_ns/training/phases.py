@@ -93,10 +93,6 @@ class Schedule:
         """The window that an absolute step trains; the last one after the end."""
         return min(step // self.window_steps, self.windows - 1)
 
-    def steps_of(self, window: int) -> range:
-        """The absolute steps that train a window."""
-        return range(window * self.window_steps, (window + 1) * self.window_steps)
-
     def _local(self, step: int) -> int:
         return step - self.window_at(step) * self.window_steps
 

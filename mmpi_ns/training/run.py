@@ -5,16 +5,19 @@ Also the rays of a batch, which move with the poses that are refined.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch import Tensor, nn
 from torch.nn import Parameter
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.data.datamanager import MMPIDataManager
 from mmpi_ns.data.rays import TrainingRays
@@ -105,6 +108,28 @@ class Progress(nn.Module):
         self.windows = WindowedPlan.from_json(to_text(self.windows_bytes))
         self.schedule = Schedule.from_json(to_text(self.schedule_bytes))
         self.window = int(self.window_number)
+
+
+@dataclass
+class PhaseSchedulerConfig(SchedulerConfig):
+    """Learning rate of one parameter kind: 0 where it is frozen, decaying over each phase in which it trains."""
+
+    _target: type = field(default_factory=lambda: PhaseScheduler)
+    kind: str = "density"
+    """Parameter kind of the group."""
+    progress: ClassVar[Progress | None] = None
+    """Not an option: the trainer gives it to its copy of the config. Rates are those of its schedule, also if a
+    checkpoint replaces that, and constant without it (a config used outside this trainer)."""
+
+
+class PhaseScheduler(Scheduler):
+    """Rates of the schedule that a run follows."""
+
+    config: PhaseSchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
+        kind, progress = self.config.kind, self.config.progress
+        return LambdaLR(optimizer, lambda step: progress.schedule.rate_factor(kind, step) if progress else 1.0)
 
 
 def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:

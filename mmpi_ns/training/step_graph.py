@@ -23,9 +23,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from mmpi_ns.data.datamanager import MMPIDataManager
-from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import Capacity
-from mmpi_ns.training.agreement import CLOSE, on_same_rows
+from mmpi_ns.training.agreement import CLOSE, differences, gradients_of
 from mmpi_ns.training.losses import TV_EVERY
 from mmpi_ns.training.touched_adam import TouchedAdam
 from mmpi_ns.utils.errors import brief, say
@@ -289,7 +288,7 @@ class StepGraphs:
             kept = fields.gain.clone(), fields.crossings.clone()
             self._zero_grad()
             results = self._find_gradients(step, capacity)
-            expected = results.values, self._gradients()
+            expected = results.values, gradients_of(fields)
             fields.gain.copy_(kept[0])
             fields.crossings.copy_(kept[1])
         self._zero_grad()
@@ -304,7 +303,7 @@ class StepGraphs:
         self._start(step)
         gradients.replay()
         if expected is not None:
-            if differs := self._difference(expected, (held[0].values, self._gradients())):
+            if differs := self._difference(expected, (held[0].values, gradients_of(fields))):
                 self._give_up(f"repeated they compute something else ({differs})")
                 return None
             self._compared.add(of_kind)
@@ -318,31 +317,13 @@ class StepGraphs:
         self._zero_grad()
         return Recorded(gradients, updates, held[0], learning)
 
-    def _gradients(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """Gradients by rows."""
-        found = {}
-        for name, parameter in self.model.field.named_parameters():
-            gradient = parameter.grad
-            if gradient is not None:
-                rows = parameter.grad_rows if isinstance(parameter, Table) else None
-                rows = torch.arange(len(gradient), device=gradient.device) if rows is None else rows
-                found[name] = rows.clone(), gradient.detach().double().flatten(1)
-        return found
-
     @staticmethod
     def _difference(expected: Any, repeated: Any) -> str:
         """In words; empty where they agree but for what the order of atomic sums explains."""
         (values, gradients), (others, their) = expected, repeated
-        wrong = []
         error = float(((others - values).abs() / values.abs().clamp(min=SMALL)).max())
-        if not error <= CLOSE:
-            wrong.append(f"losses by {error:.1%}")
-        for name, (rows, gradient) in gradients.items():
-            first, second = on_same_rows((rows, gradient), their[name])
-            error = float((first - second).norm() / first.norm().clamp(min=1e-12))
-            if not error <= CLOSE:
-                wrong.append(f"gradients of {name} by {error:.1%}")
-        return ", ".join(wrong)
+        losses = [] if error <= CLOSE else [f"losses by {error:.1%}"]
+        return ", ".join(losses + differences(gradients, their))
 
     def _give_up(self, reason: str) -> None:
         self.is_off = True

@@ -38,11 +38,10 @@ from mmpi_ns.training.checkpoints import (
     states_of,
     write_plan,
 )
-from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.options import check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
-from mmpi_ns.training.run import WINDOWS_FOLDER, TrainingRun, cameras_of, views_of
+from mmpi_ns.training.run import WINDOWS_FOLDER, PhaseSchedulerConfig, TrainingRun, cameras_of, views_of
 from mmpi_ns.training.step_graph import StepGraphs
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
@@ -358,7 +357,7 @@ class MMPITrainer(Trainer):
         if path is not None:
             progress = run.progress
             finished = dict(enumerate(progress.windows.plans[: progress.schedule.window_at(self._start_step)]))
-            run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
+            run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished)
 
 
 def _end(number: int, sentence: str = "Stopped before the first step: there is nothing to go on from.") -> NoReturn:

@@ -11,7 +11,7 @@ from training_runs import datamanager, in_capture_frame
 
 from mmpi_ns.data.datamanager import CAPTURE
 from mmpi_ns.data.posed_images import posed_images
-from mmpi_ns.rendering.exposure import Exposures
+from mmpi_ns.rendering.rendered import Exposures
 from mmpi_ns.training.losses import photometric
 from mmpi_priors.photometry import ExposedView, exposure_of_view
 

@@ -42,7 +42,7 @@ def test_exposures_of_a_run_are_loaded_with_it(run):
 def test_a_test_image_is_scored_at_its_own_exposure(run, monkeypatch, capsys):
     _, pipeline = run
     raw = pipeline.get_average_eval_image_metrics()
-    monkeypatch.setattr(pipeline.datamanager, "exposure_of", lambda *_: None)
+    monkeypatch.setattr(pipeline.datamanager.maker, "exposure_of", lambda *_: None)
     at_mean = pipeline.get_average_eval_image_metrics()
     assert raw["psnr"] > at_mean["psnr"] + 1
     assert raw["cc_psnr"] == pytest.approx(at_mean["cc_psnr"], abs=0.5)
