@@ -14,7 +14,7 @@ import mmpi_ns
 ROOT = Path(mmpi_ns.__file__).parent
 METHOD = [
     *("utils", "scene", "ops", "heads", "blending", "sampler"),
-    *("placement", "data", "field", "rendering", "training", "model", "config"),
+    *("placement", "data", "field", "rendering", "training", "viewer", "model", "config"),
 ]
 """Each may import itself and what comes before it."""
 COMPANIONS = {

@@ -10,6 +10,7 @@ import time
 
 import corridor
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 

@@ -6,9 +6,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_priors.moving import key_images
+from mmpi_priors import moving
+from mmpi_priors.dense import Depth
+from mmpi_priors.moving import find_moving, key_images
+from mmpi_priors.moving_evidence import Shot
+from mmpi_priors.views import View
 
 
 def aside(*places):

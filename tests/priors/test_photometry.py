@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mmpi_ns.data.priors import Gains
 from mmpi_priors import photometry
 from mmpi_priors.photometry import ColorRatios, ExposedView, grouped, image_gains, solve
 
