@@ -224,7 +224,7 @@ def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
         expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
         assert torch.equal(expected, found), name
     assert read.show.options == ["all", *trained.field.full_plan.names]
-    assert read.blends(read.field) == trained.blends(trained.field)
+    assert read.field.blends == trained.field.blends
 
 
 def test_the_weight_of_depth_priors_falls_with_the_rates(scene, plan_file, tmp_path, monkeypatch):

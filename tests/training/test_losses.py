@@ -55,7 +55,7 @@ def test_photometric_is_the_mean_squared_error():
 def point_color(colors, weights, observed):
     """The loss from samples, through the sums that a ray keeps of them."""
     field = MMPIField(random_plan(1, False, 0), shading="sample")
-    field.get_outputs = lambda *_: colors
+    field.sample_colors = lambda *_: colors
     composite = Composite(weights, weights[:, :1], weights[:, :1])
     _, sums = field.render_colors(None, None, None, composite)
     return losses.point_color(sums.mass, sums.first, sums.second, observed)
