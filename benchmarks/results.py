@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 import statistics
 import sys
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -164,7 +163,6 @@ def results_page(content: Row, scored: Row) -> str:
         "PSNR": "{psnr:.2f}{spread}",
         "SSIM": "{ssim:.3f}",
         "field alone": lambda r: f"{r['field_psnr']:.2f} / {r['field_ssim']:.3f}" if r["field_psnr"] else "the same",
-        "seconds": "{train_seconds:.0f}",
         "processor s": "{processor_seconds:.0f}",
         "GiB": "{gib:.1f}",
         "rendering, rays/s": "{num_rays_per_sec:.0f}",
@@ -172,7 +170,8 @@ def results_page(content: Row, scored: Row) -> str:
     missing = [key for key, row in content["rows"].items() if "not_run" in row]
     blocks = [stamp_line(content["made"])]
     for title, group in (("Defaults", "captures"), ("Longer and shorter", "length"), ("The paper's methods", "paper")):
-        blocks += [f"**{title}**", table(columns, means(content, group))]
+        if rows := means(content, group):
+            blocks += [f"**{title}**", table(columns, rows)]
     blocks += ["![PSNR and SSIM over seconds](results.png)"]
     if missing:
         blocks += [f"Not run: {'; '.join(missing)}."]
@@ -201,20 +200,23 @@ def draw(path: Path, content: Row, scored: Row) -> None:
     lengths = sorted((r for r in ours if r["group"] != "paper"), key=lambda r: r["processor_seconds"])
     if not lengths:
         return
-    kinds: Iterable[tuple[str, list[Row], str, str]] = (
-        ("mmpi, 300 to 10,000 steps", lengths, "o-", "processor_seconds"),
+    kinds: tuple[tuple[str, list[Row], str, str], ...] = (
+        ("mmpi, more and more steps", lengths, "o-", "processor_seconds"),
         ("mmpi-kitti (paper)", [r for r in ours if r["group"] == "paper"], "s", "processor_seconds"),
         ("OpenSplat", peers(scored, capture), "^", "seconds"),
     )
+    ticks = (30, 60, 120, 300, 600, 1200, 3600)
     with figure(path, 1, 2, (9, 3.4)) as (axes,):
         for axis, what, label in zip(axes, ("psnr", "ssim"), ("PSNR, dB", "SSIM"), strict=True):
-            for name, rows, style, seconds in kinds:
+            for name, rows, style, seconds in (kind for kind in kinds if kind[1]):
                 axis.plot([r[seconds] for r in rows], [r[what] for r in rows], style, label=name)
             field = f"field_{what}"
             axis.plot(
                 [r["processor_seconds"] for r in lengths], [r[field] for r in lengths], "o--", label="field alone"
             )
             axis.set(xscale="log", xlabel="processor seconds of training", ylabel=label, title=capture)
+            axis.set_xticks(ticks, [f"{t:,}" for t in ticks])
+            axis.minorticks_off()
 
 
 if __name__ == "__main__":
