@@ -35,7 +35,7 @@ from mmpi_show.ops.baked import reader
 from mmpi_show.scene import SIDE, BakedMpis, Codes, Shader, neighbours
 from mmpi_show.windows import BakedWindow
 
-FORMAT, VERSION = "mmpi-baked", 4
+FORMAT, VERSION = "mmpi-baked", 5
 HEADER = "scene.json"
 EARLY = 0.1
 """Share of a window's bytes that come first: coarse texels of the bricks that training views see most of."""

@@ -119,7 +119,7 @@ def details_of(folder: Path, step: int) -> Details | None:
     Raises InputError if it is damaged."""
     if not (folder / CAMERAS_FILE).is_file():
         return None
-    kept_at, cameras = _load(folder / CAMERAS_FILE, "step", "cameras")
+    kept_at, cameras, _ = _load(folder / CAMERAS_FILE, "step", "cameras", "here")  # differences without HERE differ
 
     def read(i: int, device: torch.device) -> DetailView:
         difference, inverse = (x.to(device) for x in _load(folder / f"{i:05d}.npz", "difference", "inverse"))
@@ -198,7 +198,7 @@ def write_details(
         write_atomically(path, partial(write_arrays, arrays=arrays))
         size += path.stat().st_size
         rows.append(_camera_row(cameras[i], bundle, kinds[i] == CameraType.FISHEYE.value))
-    arrays = {"step": np.array(step), "cameras": np.stack(rows)}
+    arrays = {"step": np.array(step), "cameras": np.stack(rows), "here": np.array(HERE)}
     write_atomically(folder / CAMERAS_FILE, partial(write_arrays, arrays=arrays))
     return f"Details of {len(rows)} training images, {size / 2**20:,.0f} MiB, are in {folder}."
 

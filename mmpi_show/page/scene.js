@@ -108,8 +108,8 @@ function halves(data) {
 
 function checkHeader(header) {
   if (!header || header.format !== "mmpi-baked") throw new Refusal("scene.json is not the header of a baked scene.");
-  if (header.version !== 4)
-    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 4: export it again.`);
+  if (header.version !== 5)
+    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 5: export it again.`);
   return header;
 }
 

@@ -78,7 +78,7 @@ def test_damage_is_one_sentence(folder):
     refused("missing")
     blob.write_bytes(whole)
     edit(folder, version=3)
-    refused("version 3", "reads version 4")
+    refused("version 3", "reads version 5")
     edit(folder, version=4, windows=[{"file": "window-00001.bin", "bytes": len(whole)}])
     refused("damaged", "bake the scene again")
     edit(folder, format="something")

@@ -36,7 +36,7 @@ class Samples(NamedTuple):
 def read(folder: Path) -> dict[str, Any]:
     """The header, with each window's arrays decoded."""
     scene = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-    assert scene["format"] == "mmpi-baked" and scene["version"] == 4
+    assert scene["format"] == "mmpi-baked" and scene["version"] == 5
     for window in scene["windows"]:
         blob = (folder / window["file"]).read_bytes()
         for name, a in window["arrays"].items():
