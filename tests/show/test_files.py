@@ -79,7 +79,7 @@ def test_damage_is_one_sentence(folder):
     blob.write_bytes(whole)
     edit(folder, version=3)
     refused("version 3", "reads version 5")
-    edit(folder, version=4, windows=[{"file": "window-00001.bin", "bytes": len(whole)}])
+    edit(folder, version=5, windows=[{"file": "window-00001.bin", "bytes": len(whole)}])
     refused("damaged", "bake the scene again")
     edit(folder, format="something")
     refused("not the header")
