@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 import torch
 
 import mmpi_ns
+import mmpi_priors
 import mmpi_scene
 from mmpi_ns.utils.machine import processor
 from mmpi_ns.utils.values import Number, check_options
@@ -161,7 +162,8 @@ def title(text: str) -> str:
 
 def fingerprint() -> str:
     """Hash of torch's version and of the sources of the packages and the benchmarks."""
-    folders = [Path(module).resolve().parent for module in (mmpi_ns.__file__, mmpi_scene.__file__, __file__)]
+    folders = [Path(module.__file__).resolve().parent for module in (mmpi_ns, mmpi_priors, mmpi_scene)]
+    folders.append(Path(__file__).resolve().parent)
     digest = hashlib.sha256(torch.__version__.encode())
     for path in sorted(p for folder in folders for p in folder.rglob("*") if p.suffix in (".py", ".cpp", ".h")):
         digest.update(path.read_bytes())

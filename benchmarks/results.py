@@ -54,8 +54,16 @@ VARIANTS = (
     Variant("room-walk", 2),
     Variant("phone-walk", 2),
     *(
-        Variant(*STREET, options=("--max-num-iterations", str(n)), name=f"{n:,} steps", group="length")
-        for n in (300, 600, 1250, 10_000)
+        Variant(*scene, options=("--max-num-iterations", str(n)), name=f"{n:,} steps", group="length")
+        for scene, lengths in (
+            (STREET, (300, 600, 1250, 10_000)),
+            (("kitti-street", 1), (1000, 16_000)),
+            (("kitchen", 2), (1000, 16_000)),
+            (("fox", 2), (1000, 16_000)),
+            (("room-walk", 2), (600, 10_000)),
+            (("phone-walk", 2), (1000, 16_000)),
+        )
+        for n in lengths
     ),
     *(
         Variant(*STREET, "mmpi-kitti", (*PAPER, *options), name=name, group="paper")
