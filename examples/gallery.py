@@ -19,7 +19,7 @@ from mmpi_ns.utils.machine import processor
 SHOWN = {
     "street": (
         Demo(kind="street", images=64),
-        "A drive of 40 m past houses and parked cars, which is what MPIs are for.",
+        "A drive of 40 m past houses and parked cars: the kind of capture that MPIs are made for.",
     ),
     "long-road": (
         Demo(kind="long-road", images=100, length=150.0, steps=400),
@@ -31,7 +31,8 @@ SHOWN = {
     ),
     "object": (
         Demo(kind="object", images=48, steps=600),
-        "An object filmed from all sides, for which MPIs are not made: from behind, one shows the edges of its planes.",
+        "An object filmed from all sides, for which MPIs are not made: seen from behind, an MPI shows the edges of its "
+        "planes.",
     ),
 }
 """Each scene with the options of making and training it, and a sentence about it."""
@@ -97,11 +98,11 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     lines = [f"| {' | '.join(cell.format(**row) for cell in COLUMNS.values())} |" for row in rows]
     parts = [
         "# Gallery",
-        "Four procedural scenes, each trained with `mmpi-small` for some minutes on one core. PSNR and SSIM are means "
-        "over the test images; depths are found in the training images; the exact ones are not used.",
+        "Four procedural scenes, trained for minutes on one core. PSNR and SSIM are means over the test images. The "
+        "exact depths are not used.",
         "\n".join([f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS), *lines]),
         f"Made by `make gallery` on {processor()}, commit {commit}; seconds are from the start of `ns-train` to its "
-        "last checkpoint, on a machine that did other things too.",
+        "last checkpoint, beside other programs.",
     ]
     for row in rows:
         name = row["name"]

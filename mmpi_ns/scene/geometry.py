@@ -1,4 +1,4 @@
-"""The MPI frame: world <-> NDC, plane hits and the live interval of a ray (docs/how_it_works.md, "Geometry").
+"""The MPI frame: world <-> NDC, plane hits and the planes that a ray intersects (docs/how_it_works.md, "Geometry").
 
 Everything here is affine in disparity w = 1/depth, so a plane at infinity (w = 0) is an ordinary plane.
 Points are represented as homogeneous pairs ``(o/t + d, 1/t)``, which are finite and exact at infinity.
@@ -112,7 +112,7 @@ def plane_hits(
     Returns:
         The live range of every ray in every MPI and the affine maps from disparity to (u, v).
 
-    Source: MMPI paper, sec. III-B ("sample and merge", forward-facing check); docs/how_it_works.md, "Live interval".
+    Source: paper, sec. III-B ("sample and merge", forward-facing check); docs/how_it_works.md, "Intersected planes".
     """
     local = LocalRays.of(origins, directions, frames)
     o, d = local.local_origins, local.local_directions

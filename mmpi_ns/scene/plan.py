@@ -216,7 +216,7 @@ class ScenePlan:
     def from_object(data: Any) -> ScenePlan:
         """The plan that a JSON object describes. Raises as ``from_json``."""
         if isinstance(data, dict) and not isinstance(data.get("mpis", []), list):
-            raise InputError("The scene plan's 'mpis' is not a list: compare it with docs/how_it_works.md.")
+            raise InputError("The scene plan's 'mpis' is not a list: compare it with docs/placement.md.")
         check_fields(ScenePlan, data, "The scene plan")
         mpis = []
         for i, row in enumerate(data["mpis"]):
@@ -242,22 +242,20 @@ def read_object(text: str) -> dict:
     except (ValueError, RecursionError) as error:
         raise InputError(f"The scene plan is not valid JSON ({brief(error)}): fix it or leave it out.") from error
     if not isinstance(data, dict):
-        raise InputError(
-            "The scene plan is not a JSON object with a list 'mpis': compare it with docs/how_it_works.md."
-        )
+        raise InputError("The scene plan is not a JSON object with a list 'mpis': compare it with docs/placement.md.")
     return data
 
 
 def check_fields(cls: type, data: Any, where: str) -> None:
     """Raises InputError if ``data`` is not a JSON object with the fields of a class."""
     if not isinstance(data, dict):
-        raise InputError(f"{where} is not a JSON object: compare it with docs/how_it_works.md.")
+        raise InputError(f"{where} is not a JSON object: compare it with docs/placement.md.")
     names = {f.name for f in fields(cls)}
     optional = {f.name for f in fields(cls) if f.default is not MISSING}
     unknown, missing = set(data) - names, names - set(data) - optional
     if unknown or missing:
         wrong = f"lacks {sorted(missing)}" if missing else f"has unknown fields {shown(sorted(unknown))}"
-        raise InputError(f"{where} {wrong}: compare it with docs/how_it_works.md.")
+        raise InputError(f"{where} {wrong}: compare it with docs/placement.md.")
 
 
 def _tuples(value: Any) -> Any:
