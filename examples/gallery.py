@@ -109,9 +109,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         parts += [
             f"## {name}",
             row["says"],
-            f"![A test view of the scene '{name}': truth, rendering, depth, winning MPI, and the MPIs from above]"
-            f"(images/gallery/{name}.jpg)",
-            f"![Flight through the scene '{name}': rendering, depth, winning MPI](images/gallery/{name}.webp)",
+            f"![{name}: truth, rendering, depth, winning MPI, plan](images/gallery/{name}.jpg)",
+            f"![{name}, from a moving camera](images/gallery/{name}.webp)",
         ]
     return "\n\n".join(parts) + "\n"
 
