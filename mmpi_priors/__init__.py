@@ -1,1 +1,2 @@
-"""What the images of a capture tell beside their colours: tracks, depths with errors, exposure, masks, new views."""
+"""Priors from the training images: tracks, depths with errors, exposures, masks of moving objects, rays of new
+views."""

@@ -1,4 +1,4 @@
-"""Slow results that depend on files: kept in the user's cache folder, computed once by all processes."""
+"""Cache of slow results that depend on files, in the user's cache folder; processes share them."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from mmpi_ns.utils.arrays import Arrays, Pairs, write_arrays
 from mmpi_ns.utils.files import cache_folder, write_atomically
 
 VERSION = 2
-"""Of all that is kept: results of another version are found anew."""
+"""Version of all cached results: those of another version are computed again."""
 KEPT = 24
 """Number of cached results; the least recently used is removed first."""
 
 MOST_BYTES = 10e9
-"""Of all results that are kept; the last one is kept whatever its size."""
+"""Bytes of all cached results; the last one is kept whatever its size."""
 
 HELD, HELD_BYTES = 32, 2**28
-"""Images that are kept while their neighbours are compared with them, and the bytes that they may take."""
+"""Images kept in memory while their neighbours are compared with them, and bytes that they may take."""
 
 T = TypeVar("T")
 
@@ -65,7 +65,7 @@ class Computed(Sequence[T]):
 def held(
     function: Callable[[int], T], sizes: NDArray[np.float64], bytes_of_pixel: int, least: int
 ) -> Callable[[int], T]:
-    """A function of an image's number that keeps its last results while neighbours are compared with them.
+    """A function of an image's number that caches its last results while neighbours are compared with them.
 
     Threads that ask for the same image at once share one call. Results of images of these sizes [M, 2] are kept as long
     as they take ``HELD_BYTES`` at most, but ``least`` in any case: as many as an image is compared with.
@@ -86,7 +86,8 @@ def held(
 
 
 def kept(name: str, images: PosedImages, settings: Sequence[object], find: Callable[[], Arrays | Pairs]) -> Arrays:
-    """What ``find`` gives (see ``remembered``): kept under this name for these images, their cameras and settings."""
+    """The result of ``find`` (see ``remembered``), cached under this name for these images, their cameras and
+    settings."""
     cameras = images.camera_to_worlds, images.intrinsics, images.distortion, images.fisheye
     return remembered(digest(images.files, name, VERSION, *cameras, *settings), find)
 

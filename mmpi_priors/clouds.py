@@ -1,9 +1,9 @@
 """Points of a cloud (``ply_file_path``), and which training images see them.
 
-A cloud does not say which images saw its points, and projection alone would see through walls. Where a pixel's depth is
-known from matches, a point is visible if it lies there, hidden if it lies behind, and contradicted if it lies in front:
-then the image looks through it. Elsewhere coarse depth images of the cloud decide: a point is visible if no other one
-lies clearly in front of it, in its cell or a neighbouring one.
+A cloud does not record which images see its points, and projection alone would see through walls. Where a pixel has a
+depth from matches, a point is visible if it lies there, occluded if it lies behind, and contradicted if it lies in
+front: then the image sees through it. Elsewhere coarse depth images of the cloud decide: a point is visible if no other
+one lies clearly in front of it, in its cell or a neighbouring one.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ POINT_ERROR = 0.01
 CONTRADICTS = 6.0
 """Difference of two sources, in expected errors of both, from which one of them is wrong."""
 MOST_POINTS, FARTHEST = 100_000, 1e5
-"""Points that are used of a larger cloud, such as a laser scan's; distance of one from the cameras, over their own
-extent, from which it is a mistake."""
+"""Maximum number of points, a random subset of a larger cloud such as a laser scan; distance of a point from the
+cameras, over their extent, above which it is an outlier."""
 
 
 def point_cloud(outputs: DataparserOutputs, parser: DataParserConfig) -> Array | None:
-    """The points of a capture's cloud [P, 3] in the scene's frame; None if it has none, or they are not asked for."""
+    """Points of a capture's cloud [P, 3] in the scene's frame; None if it has none, or they are not asked for."""
     given = outputs.metadata.get("points3D_xyz")
     if given is not None:
         return given.double().numpy()
@@ -77,14 +77,14 @@ def read_ply(path: Path) -> Array | None:
 
 
 def contradict(a: Map, b: Map) -> NDArray[np.bool_]:
-    """Mask [...] of two sources' inverse distances [..., 2] that differ by more than their errors can explain."""
+    """Mask [...] of two sources' inverse distances [..., 2] that differ by more than their errors allow."""
     apart = np.abs(a[..., 0] - b[..., 0]) > CONTRADICTS * np.hypot(a[..., 1], b[..., 1])
     return apart & (a[..., 0] > 0) & (b[..., 0] > 0)
 
 
 def usable_points(points: Array, centers: Array) -> Array:
-    """The points of a cloud [P, 3] that can be used, a random subset of ``MOST_POINTS`` if there are more; says how
-    many are NaN or absurdly far away from the cameras [M, 3]."""
+    """Usable points of a cloud [P, 3], a random subset of ``MOST_POINTS`` if there are more; prints how many are NaN or
+    too far from the cameras [M, 3]."""
     middle = np.median(centers, axis=0)
     extent = float(np.ptp(centers, axis=0).max())
     with np.errstate(invalid="ignore"):
@@ -102,7 +102,7 @@ def usable_points(points: Array, centers: Array) -> Array:
 
 @dataclass(frozen=True)
 class Sightings:
-    """Places at which training images see the points of a cloud."""
+    """Pixels at which training images see the points of a cloud."""
 
     points: Array
     """[P, 3]"""
@@ -113,17 +113,18 @@ class Sightings:
     seen_at: Array
     """[Q, 2] pixel (x, y)."""
     confirmed: NDArray[np.int64]
-    """[P] images in which a point lies at the known depth of its pixel."""
+    """[P] number of images in which a point lies at the depth of its pixel."""
     contradicted: NDArray[np.int64]
-    """[P] images whose known depth there is behind it."""
+    """[P] number of images whose depth there is behind the point."""
 
     @property
     def fits(self) -> bool:
-        """True if at least as many points are confirmed as contradicted."""
+        """Whether at least as many points are confirmed as contradicted."""
         return bool((self.confirmed > self.contradicted).sum() >= (self.contradicted > self.confirmed).sum())
 
     def added_to(self, tracks: Observations) -> Observations:
-        """The observations with these after the keypoints of their tracks; contradicted points are left out."""
+        """The observations with these sightings after the keypoints of their tracks; contradicted points are
+        dropped."""
         kept = (self.contradicted <= self.confirmed)[self.seen_point]
         count, first = len(tracks.seen_at), len(tracks.points)
         return replace(
@@ -155,8 +156,8 @@ class Sightings:
 
 
 def see_points(points: Array, posed: PosedImages, depths: Callable[[int], Map] | None = None) -> Sightings:
-    """Sightings of points [P, 3] in the training images; ``depths`` are an image's known inverse distances and their
-    errors, 0 where unknown. [H, W, 2]"""
+    """Sightings of points [P, 3] in the training images; ``depths`` gives an image's inverse distances and their
+    errors, 0 where there are none. [H, W, 2]"""
     seen: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
     confirmed, contradicted = np.zeros((2, len(points)), np.int64)
     for i, size in enumerate(posed.sizes):

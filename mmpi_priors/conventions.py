@@ -1,4 +1,4 @@
-"""Whether cameras contradict their images, and which convention would explain the images.
+"""Check of cameras against their images: whether matches contradict them, and which convention would fit.
 
 The commonest mistakes in a file of poses are camera axes of another program, world to camera in place of camera to
 world, left-handed axes, intrinsics of another image size, and a lens that is left out. Verified matches of features do
@@ -28,28 +28,30 @@ LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 PROGRAMS = (("OpenGL's", OPENGL), ("OpenCV's", OPENCV), ("LLFF's", LLFF), ("Unity's", np.diag([1.0, -1.0, 1.0])))
 DIRECTIONS = (("right", "left"), ("down", "up"), ("forward", "back"))
 MOST, LEAST = 4000, 60
-"""Matches that are looked at, and the fewest that tell anything."""
+"""Maximum number of matches that are tested, and minimum number for a result."""
 BETTER, CHANCE = 0.4, 0.5
 """Share of the error as given to which a convention must lower it; share of the error of wrong conventions from which a
 pose fits no better than by chance."""
 ALIKE = 1.25
-"""Ratio of errors within which the more usual convention is believed."""
+"""Ratio of errors within which the more usual convention is preferred."""
 FOCALS = np.geomspace(0.2, 5.0, 17)
 """Focal lengths, over the given one, that are tried."""
 FINE = 0.0005
-"""Median distance of the matches from the epipolar lines, over the image's width, up to which cameras are right."""
+"""Median distance of the matches from the epipolar lines, relative to the image's width, up to which cameras are
+right."""
 USUAL = 5
 """Readings of the matrices, the most usual, that are tried with other intrinsics."""
 PLAUSIBLE, MOST_BENT = (0.25, 5.0), 0.5
-"""Focal lengths over the width, and terms of a lens, that are believed."""
+"""Plausible ranges of focal length over width and of lens coefficients."""
 GRAVE = 0.002
-"""The same from which cameras are too wrong to be used, and up to which other intrinsics explain the matches."""
+"""Median distance from which cameras are unusable, and up to which other intrinsics fit the matches."""
 HOPELESS, SHUFFLES = 0.004, 5
-"""The same from which cameras that nothing explains are given up; times that poses are dealt out to other images."""
+"""Median distance from which cameras that no convention fits are refused; random permutations of the poses for
+comparison."""
 FOCAL_WRONG = 0.2
-"""Logarithm of the focal length that fits over the given one, from which the same holds."""
+"""Log ratio of the fitted and the given focal length from which cameras are unusable."""
 FAR = 0.01
-"""Distance from an epipolar line, over the image's width, above which all count the same in a fit."""
+"""Distance from an epipolar line, relative to the image's width, at which errors are truncated in a fit."""
 
 
 @dataclass(frozen=True)
@@ -117,15 +119,15 @@ class Convention:
         return poses
 
     def is_of_axes(self, given: Array) -> bool:
-        """Whether it differs from what was given in the matrices."""
+        """Whether it differs from the given one in the matrices, not only in the intrinsics."""
         return self.inverted or self.mirrored or not np.array_equal(self.axes, given)
 
 
 def find_convention(
     matrices: Array, given: Array, lens: tuple[Array, Array, Array], matches: Matches
 ) -> tuple[Convention, Convention | None, bool]:
-    """How well matches fit cameras, the convention that explains them if theirs does not, and whether the cameras are
-    too wrong to be used: another convention explains the matches, or they fit no better than by chance.
+    """Fit of matches to cameras, the convention that fits them better if there is one, and whether the cameras are
+    unusable: another convention fits the matches, or these fit no better than by chance.
 
     Args:
         matrices: of a file, camera to world if it is right. [M, 4, 4]
@@ -227,7 +229,7 @@ class _Problem:
         return bool(ahead.all(0).sum() >= behind.all(0).sum())
 
     def is_plausible(self, convention: Convention) -> bool:
-        """Whether there may be such intrinsics."""
+        """Whether the intrinsics are plausible."""
         focal = convention.focal * float(np.median(self.over_width))
         return PLAUSIBLE[0] < focal < PLAUSIBLE[1] and max(map(abs, convention.bend or (0.0,))) < MOST_BENT
 
@@ -274,7 +276,7 @@ class _Problem:
 
 
 def in_words(found: Convention, given: Array, focal: float, as_pixels: float, was: float) -> str:
-    """What a convention says of the cameras of a file.
+    """Description of a convention for the user.
 
     Args:
         found, given: the convention, and the axes that were expected.

@@ -1,10 +1,10 @@
 """Depth of most pixels of the training images: dense matches between neighbouring views, each with its error.
 
-Every image is compared with its nearest neighbours. A rough depth, from SfM points and planes searched at a low
-resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, found by optical
-flow (``ops/motion``), is small. A match on its epipolar line gives an inverse depth; consistent matches of several
-neighbours are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV and
-NumPy release Python's lock), and an image is in memory only while its neighbours are worked on.
+Every image is compared with its nearest neighbours. A rough depth, from SfM points and PatchMatch planes at a low
+resolution (``patches.py``), warps the neighbour into the image, so that the remaining displacement, estimated by
+optical flow (``ops/motion``), is small. A match on its epipolar line gives an inverse depth; consistent matches of
+several neighbours are averaged; where there are hardly any, the planes' depths remain. Threads share the images (OpenCV
+and NumPy release Python's lock), and an image is in memory only while its neighbours are worked on.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
@@ -37,9 +37,9 @@ from mmpi_priors.views import Map, Parallax, View, load_view, look_up, pixel_gri
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
-"""Wraps what is worked on, of which there is this much."""
+"""Progress wrapper of an iterable and its length."""
 Flow = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32]]
-"""Motion of what one image shows to another, right and down, pixels. [H, W, 2]"""
+"""Optical flow from one image to another, right and down, pixels. [H, W, 2]"""
 
 NEIGHBOURS, MAX_ANGLE = 4, 40.0
 """Nearest views that each image is compared with, and the largest angle in degrees between their directions."""
@@ -48,7 +48,7 @@ LARGE = 640
 LEAST_FLOW = 16
 """Pixels of an image's shorter side from which on it is matched at a reduced size."""
 SMALLEST = 12
-"""Pixels of the shorter side that optical flow needs."""
+"""Minimum shorter side for optical flow, pixels."""
 ROUNDS, SEARCHED = {False: (1, 1, 1), True: (2, 1)}, {False: (1, 1), True: (1,)}
 """Rounds of matching, of small and of large images, at the working size divided by this; and with surfaces."""
 SECONDS, SEARCH_SECONDS = 0.55, 0.15
@@ -62,32 +62,33 @@ WINDOW = 7
 MIN_CORRELATION, MIN_CONTRAST = 0.5, 1.0
 """Least correlation of windows that match, and least standard deviation of their gray levels."""
 EDGE, STEP = 9, 1.1
-"""An edge: inverse depths that differ by this factor in a window of this many pixels. Background there moves along."""
+"""Factor between inverse depths at an edge, and side of the window in which it is sought, pixels. Background there
+moves with the foreground."""
 OWN_CONTRAST = 4.0
 """Standard deviation of gray levels in 3 x 3 pixels that a match near an edge needs."""
 SAME_DEPTH = 0.03
 """The depths of a point in two images agree within this fraction plus three of their errors."""
 MAX_RELATIVE = 0.15
-"""Depths with a larger relative error are discarded."""
+"""Maximum relative error of a depth."""
 AROUND, MEASURED = 1 / 20, 0.5
 """Side of the square about a pixel, as a fraction of the longer side of the image, and the share of measured pixels in
-it from which on planes add no depth: in gaps between matches they made pictures worse (docs/ablations.md)."""
+it above which planes add no depth: in gaps between matches they lowered the quality of the images."""
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
 TRIMMED = 8
-"""Images after which free memory goes back: glibc keeps it in pieces, for each thread its own."""
+"""Number of images after which free memory is returned: glibc keeps it in pieces, per thread."""
 
 
 @dataclass(frozen=True)
 class Depth:
-    """Inverse depth along the optical axis, and its expected error; both 0 where unknown. [h, w]"""
+    """Inverse depth along the optical axis, and its expected error; both 0 where there is none. [h, w]"""
 
     inverse: Map
     error: Map
 
 
 def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
-    """Inverse depth of every pixel [h, w], interpolated between SfM points [P, 3] that the image saw."""
+    """Inverse depth of every pixel [h, w], interpolated between SfM points [P, 3] of the image."""
     height, width = view.gray.shape
     local = (points - view.pose[:, 3]) @ view.pose[:, :3]
     local = local[local[:, 2] < 0]
@@ -110,7 +111,7 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
 
 def measure(view: View, neighbour: View, start: Map, flow: Flow, of_view: tuple[Map, Map]) -> Measured:
     """Inverse depths of a view's pixels by comparison with another view, from rough inverse depths and the view's
-    ``mean_and_contrast``; ``flow`` finds small motions."""
+    ``mean_and_contrast``; ``flow`` computes optical flow."""
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
     motion = flow(view.gray, look_up(neighbour.gray, x, y))
@@ -153,16 +154,16 @@ def find_depths(
     rounds: Sequence[int] | None = None,
     among: Sequence[int] | None = None,
 ) -> Iterator[T]:
-    """The depths of all images in turn, by all threads; their number does not change the depths.
+    """Depths of all images in turn, on all threads; their number does not change the result.
 
     Args:
         images: the training images in their originals.
-        points_of: SfM points [P, 3] that an image saw.
+        points_of: SfM points [P, 3] of an image.
         side: longer side of the images at working size, pixels, at most.
         finish: makes an image's result from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
         rounds: of matching; None: by size.
-        among: the images that others are compared with; None for all.
+        among: the images that others may be compared with; None for all.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
         results = in_turn(_tasks(pool, images, points_of, side, finish, rounds, among), num_threads() + 1)
@@ -182,7 +183,8 @@ def _tasks(
     rounds: Sequence[int] | None,
     among: Sequence[int] | None,
 ) -> Iterator[tuple[bool, Future[Any]]]:
-    """Matches and confirms images, in an order in which no thread waits for a later task; True: an image's last task.
+    """Tasks that match and confirm images, in an order in which no thread waits for a later task; True: an image's last
+    task.
 
     An image is forgotten once all tasks that need it are submitted, which alone hold it then.
     """
@@ -217,13 +219,13 @@ def _tasks(
 
 
 def matched(view: View, others: list[View], points: NDArray[np.float64], rounds: Sequence[int] | None = None) -> Depth:
-    """The depths of a view by comparison with other views: planes at a low resolution, then optical flow, and planes
-    again where that gives hardly anything. ``rounds`` of optical flow alone, if there are any."""
+    """Depths of a view by comparison with other views: planes at a low resolution, then optical flow, and planes again
+    where that gives hardly any. ``rounds`` of optical flow alone, if there are any."""
     if not others or min(view.gray.shape) < SMALLEST:
         return Depth(*np.zeros((2, *view.gray.shape), np.float32))
     is_large = max(view.gray.shape) >= LARGE
     flow: Flow = partial(find_motion, stride=STRIDE[is_large], rounds=COMPARISONS)
-    if rounds:  # OpenCV's, with which what tells movers was chosen: whole cars depend on it (docs/ablations.md)
+    if rounds:  # OpenCV's flow, with which the settings of moving-object detection were chosen
         search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         search.setFinestScale(0)
         search.setVariationalRefinementIterations(0)
@@ -262,7 +264,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
 
 
 def without_fringes(view: View, depth: Depth) -> Depth:
-    """Removes the fringe around a foreground object where the background has no texture of its own."""
+    """Depths without the fringes around foreground objects where the background has no texture."""
     has_depth = depth.inverse > 0
     least = cv2.erode(np.where(has_depth, depth.inverse, 1e30).astype(np.float32), np.ones((EDGE, EDGE), np.uint8))
     variance = _mean(view.gray, 3, squared=True) - _mean(view.gray, 3) ** 2
@@ -271,7 +273,7 @@ def without_fringes(view: View, depth: Depth) -> Depth:
 
 
 def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Depth:
-    """Keeps the depths confirmed by the depth of at least one other image and by at least as many as contradict it."""
+    """Depths that at least one other image confirms, and at least as many as contradict them."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
     for neighbour, theirs in others:
         here, there = ((torch.from_numpy(d.inverse), torch.from_numpy(d.error)) for d in (depth, theirs))

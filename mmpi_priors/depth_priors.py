@@ -1,4 +1,4 @@
-"""Known distances of training pixels: inverse distance and expected error, from all sources.
+"""Depth priors of training pixels: inverse distance and expected error, from all sources.
 
 Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM points, depth images of a sensor.
 """
@@ -49,7 +49,7 @@ CELLS = 32
 SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
 MOST_KEYPOINTS = 3.0
-"""Multiple of the cells with a depth above which placement leaves keypoints out."""
+"""Multiple of the number of cells with a depth above which placement ignores keypoints."""
 
 
 def make_depth_priors(
@@ -134,7 +134,7 @@ def _kept(
 
 
 def with_sensor(depths: DepthPriors, files: list[Path], unit: float, posed: PosedImages) -> DepthPriors:
-    """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept.
+    """Depths with those of sensors in place of others; where the two contradict each other, neither is kept.
 
     ``files`` are the depth images of all training images, and ``unit`` is the length of a depth of 1, scene units.
     """
@@ -189,7 +189,7 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
 def with_continued(depths: DepthPriors, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> DepthPriors:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
-    Masked pixels have no distance: what moves is nowhere.
+    Masked pixels get no distance: moving objects have no fixed position.
     """
 
     def codes_of(i: int) -> Codes:
@@ -222,11 +222,11 @@ def with_continued(depths: DepthPriors, posed: PosedImages, dataset: MMPIDataset
 
 
 def of_cells(observations: Observations, depths: DepthPriors, dataset: MMPIDataset) -> Observations:
-    """The observations that placement weighs: of each image cell the pixel with the most certain depth.
+    """The observations for placement: of each image cell the pixel with the most certain depth.
 
-    Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then draw MPIs and texels
-    to the parts of the images that an SfM model or a cloud is densest in. Points of searched surfaces are rougher and
-    leave. Without depths nothing changes.
+    Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then draw MPIs and texels to
+    the parts of the images that an SfM model or a cloud is densest in. Points of estimated surfaces are less accurate
+    and are dropped. Without depths nothing changes.
     """
 
     def points_of(i: int) -> NDArray[np.float64]:
@@ -265,7 +265,7 @@ def of_cells(observations: Observations, depths: DepthPriors, dataset: MMPIDatas
 
 
 def with_points(depths: DepthPriors, observations: Observations) -> DepthPriors:
-    """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
+    """Depths with the distances of SfM points at their keypoints; the nearest where several fall on one pixel."""
     cameras, points = observations.tracked
     distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
     inverse = packed(np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]))

@@ -1,9 +1,9 @@
-"""Depth where hardly any other training image looks: extrapolated from surrounding surfaces.
+"""Depth extrapolated from surrounding surfaces, where hardly any other training image looks.
 
-In regions that at most one other training image shows, such as the borders of the first image of a drive, little can be
-matched, and content at many distances explains the colours. There, nearby known surfaces (the road, a wall) are
+In regions that at most one other training image sees, such as the borders of the first image of a drive, little can be
+matched, and content at many distances fits the colours. There, nearby surfaces with a depth (the road, a wall) are
 extrapolated. A plane n.x = d appears along the unit direction v at the inverse distance n.v / d, which is linear in v
-for any lens. So w.v is fitted to the inverse distances of the known pixels around a pixel.
+for any lens. So w.v is fitted to the inverse distances of the pixels with a depth around a pixel.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)
 PIXELS = 2.0
 """Largest standard deviation of a blur in pixels; wider ones are computed on smaller images."""
 ENOUGH = 0.05
-"""Smallest weighted fraction of known pixels around a pixel for which a plane is fitted."""
+"""Smallest weighted fraction of pixels with a depth around a pixel for which a plane is fitted."""
 LEAST_ERROR, MOST_ERROR = 0.05, 0.3
 """Minimum relative error of an extrapolated distance, and the error above which it is discarded."""
 NEAREST, MOST_OTHERS = 16, 1
-"""Nearby images that are checked for a point, and those in which a lone one may lie; with more, matches and colours are
-more reliable."""
+"""Nearby images that are checked for a point, and maximum number of them that may see a lone one; with more, matches
+and colours are more reliable."""
 
 
 def continued(depths: Map, directions: Map) -> Map:
@@ -39,7 +39,7 @@ def continued(depths: Map, directions: Map) -> Map:
         directions: [H, W, 3] unit directions of the pixels.
 
     Returns:
-        [H, W, 2] the same for the other pixels only: 0 where a depth is known, and where no plane fits.
+        [H, W, 2] the same for the other pixels only: 0 where ``depths`` has one, and where no plane fits.
     """
     inverse, error = depths[..., 0].astype(np.float64), depths[..., 1].astype(np.float64)
     has_depth = inverse > 0
@@ -88,7 +88,7 @@ def _dot(a: Sequence[NDArray[np.float64]], b: Sequence[NDArray[np.float64]]) -> 
 
 
 def is_lone(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether at most ``MOST_OTHERS`` images near image i may show each of its points [P, 3]. [P]"""
+    """Whether at most ``MOST_OTHERS`` images near image i may see each of its points [P, 3]. [P]"""
     count, lone = np.zeros(len(points), np.int64), np.arange(len(points))
     for j in nearest_views(posed.camera_to_worlds, i, NEAREST):
         if not len(lone):

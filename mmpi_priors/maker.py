@@ -1,4 +1,4 @@
-"""All priors of a capture by one call: what ``ns-train`` and ``mmpi-plan`` know of the images beside their colours."""
+"""All priors of a capture by one call, for ``ns-train`` and ``mmpi-plan``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from mmpi_priors.settings import CapturePriorsConfig
 
 
 class CapturePriors(PriorsMaker):
-    """Makes the priors of a capture as its settings ask. ``make`` sets the ``moving`` masks of the data set."""
+    """Computes the priors of a capture that its settings ask for. ``make`` sets the ``moving`` masks of the data
+    set."""
 
     def __init__(self, config: CapturePriorsConfig, **kwargs: Any) -> None:
         super().__init__(config, **kwargs)
@@ -43,7 +44,7 @@ class CapturePriors(PriorsMaker):
     def make(self) -> Priors:
         config, dataset, observations, movers = self.config, self.dataset, self.observe(find_points=True), ""
         if config.mask_moving and None in dataset.mask_files:
-            # A mask file of the user wins over what is seen to move.
+            # A mask file of the user takes precedence.
             masks, doubt = self._moving(observations)
             masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
             movers, is_masked = share_of_moving(masks), any(mask.any() for mask in masks)
@@ -63,7 +64,7 @@ class CapturePriors(PriorsMaker):
         return Priors(**{**vars(priors), "new_views": lambda *chosen: self._new_views(priors, *chosen)})
 
     def _moving(self, observations: Observations) -> tuple[Sequence[NDArray[np.bool_]], str]:
-        """What moves in each image, and why that is doubtful; nothing where lenses cannot be undone."""
+        """Masks of moving objects in each image, and why they are doubtful; none where lenses cannot be undistorted."""
         shapes = [(int(h), int(w)) for w, h in observations.sizes]
         posed = posed_images(observations, self.dataset)
         if posed is None:
@@ -71,7 +72,7 @@ class CapturePriors(PriorsMaker):
         return moving_masks(at_full_size(posed), shapes, *observations.tracked)
 
     def _gains(self, observations: Observations, depths: DepthPriors | None) -> Gains | None:
-        """Exposures of the training images, where they differ."""
+        """Exposures of the training images; None if they are equal."""
         posed = posed_images(observations, self.dataset)
         if depths is None or posed is None or len(posed.files) < 2:
             return None
@@ -93,7 +94,7 @@ class CapturePriors(PriorsMaker):
         device: str | torch.device,
         exposures: Float[Tensor, "M 3"] | None,
     ) -> tuple[SharedPoints | None, str]:
-        """Points that two of the images, by number, see at one depth; and why there are none."""
+        """Points that two of the images, by number, see at the same depth; and why there are none."""
         if priors.depths is None or priors.depths.share == 0:
             return None, "no pixel has a known depth"
         posed = posed_images(priors.observations, self.dataset)

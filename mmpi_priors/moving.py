@@ -1,10 +1,10 @@
-"""What moves in the images of a scene: cars and people that no static scene explains, as masks.
+"""Masks of moving objects: cars and people that no static scene can explain.
 
-Every image is compared with its neighbours at reduced size (``moving_evidence.py``), also at depths that only something
-that moves can seem to have (``moving_sweep.py``); what is left over grows to objects (``moving_objects.py``). A second
-look near images in which something moves does without what moves in them, and only what it shows by itself is followed
-to other images; outlines are drawn anew at the end (``moving_outline.py``). Of a video, key images are compared with
-each other, and the images between them only where something moves near them.
+Every image is compared with its neighbours at reduced size (``moving_evidence.py``), also at inverse depths that are
+impossible for static points (``moving_sweep.py``); pixels that fit none grow to objects (``moving_objects.py``). A
+second pass near images with moving objects ignores those objects in the neighbours, and only its own detections are
+tracked into other images; outlines are computed again at the end (``moving_outline.py``). In a video, key images are
+compared with each other, and the images between them only near moving objects.
 """
 
 from __future__ import annotations
@@ -39,39 +39,39 @@ from mmpi_priors.upright import upright
 from mmpi_priors.views import Parallax, View, look_up, project, straightened, straightened_color
 
 SIDE = 384
-"""Longer side of the images at which is compared, pixels."""
+"""Longer side of the images at working size, pixels."""
 RANKS = (0, 1, 2, 3, 5, 8)
-"""Neighbours that an image is compared with, by nearness: farther ones see what something slow hides from near ones."""
+"""Neighbours that an image is compared with, by distance: farther ones see what a slow object occludes in near ones."""
 MAX_ANGLE = 40.0
-"""Degrees between the facing directions of images that are compared."""
+"""Maximum angle between the directions of images that are compared, degrees."""
 ROUNDS = (2, 1)
 """Of dense matching: at half the size, then at that size."""
 AFTER = 2
-"""Nearest neighbours from which objects are followed by optical flow."""
+"""Nearest neighbours from which objects are tracked by optical flow."""
 FURTHER, SIDES, ASIDE = 2, 8, 0.005
-"""Times that objects are followed from image to image at the sides of a drive, at most; the part of an image's width
-that is its side, on the left and on the right, and the share of an image that must have been masked there since."""
+"""Maximum number of images that objects are tracked through at the sides of a drive; width of a side as a share of the
+image's; minimum share of an image that is newly masked there."""
 EDGE = 0.4
-"""Share of a mover around a pixel from which it is masked."""
+"""Share of moving pixels around a pixel from which it is masked."""
 SECONDS = 0.35
-"""Processor seconds for an image, for the forecast (docs/moving.md)."""
+"""Processor seconds for an image, for the forecast."""
 LARGE = 0.015
-"""Share of an image that must be masked in one of them, or nothing is."""
+"""Minimum share of masked pixels in the image that has most; below it nothing is masked."""
 COMPARED, FIRST, FEW = 0.02, 0.06, 30
-"""Median distance between points in a key image and in the next one, in widths, at most: of those that others are
-compared with, as what moves slowly hides the same from images that follow closely, and of those that are looked at
-first. Fewer points tell nothing."""
+"""Maximum median displacement of points from a key image to the next, in widths: of key images that others are compared
+with (in consecutive images slow objects occlude the same background), and of those that are searched first; and minimum
+number of points for it."""
 KNOWN, CONTRAST = 0.5, 3.0
 """Share of the textured pixels (standard deviation of gray levels around them) whose depths other images confirm, in
-half of the images at least, or nothing is masked: where most pixels are unexplained, what moves is not told from what
-is hidden or was not found again. Of a procedural walk 0.62 are known and 90 % of the people are masked, of every third
-of its images 0.52 and 21 %; of a film of one frame a second 0.39, and rocks were masked instead of the man."""
+half of the images at least, or nothing is masked: where most pixels have no confirmed depth, motion cannot be told from
+occlusion and failed matches. On a procedural walk it is 0.62, and 90 % of the people are masked; with every third of
+its images 0.52 and 21 %; on a film of one frame a second 0.39, and rocks were masked instead of the man."""
 ENOUGH, SAMPLES = 200, 5000
-"""Pixels of one depth in both images from which their exposures are compared, at least and at most."""
+"""Minimum and maximum number of pixels of equal depth in both images from which their exposures are compared."""
 SHOWN, COLUMNS, WIDTH = 24, 4, 320
 """Images in the picture for reports, those in a row, and pixels across each."""
 RED = (0, 0, 127)
-"""Blue, green, red that half of a masked pixel's colour is replaced by."""
+"""Blue, green, red that is mixed in equal parts with masked pixels."""
 
 
 def find_moving(
@@ -79,12 +79,12 @@ def find_moving(
     points_of: Callable[[int], NDArray[np.float64]],
     progress: Progress = lambda work, _: work,
 ) -> tuple[list[View], list[Mask], str]:
-    """Views of images at working size, masks of what moves in them, and why these are doubtful, if they are, in a
-    sentence; the number of threads does not change it.
+    """Views of images at working size, masks of moving objects in them, and a sentence why the masks are doubtful, if
+    they are; the number of threads does not change the result.
 
     Args:
         images: the originals.
-        points_of: SfM points [P, 3] that an image saw.
+        points_of: SfM points [P, 3] of an image.
         progress: wraps the images as they are worked on.
     """
     up = upright(images.camera_to_worlds)
@@ -126,7 +126,7 @@ def find_moving(
             masks[i] = mask
         looks = {i: look for i, (_, look) in zip(again, second, strict=True)}
         masks = _followed_on(shots, near, masks, looks, pool)
-        # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
+        # Moving objects come close at some time; false detections are mostly small.
         if max((mask.mean() for mask in masks), default=0.0) >= LARGE:
             masks = _outlined(shots, near, masks, looks, pool)
         else:
@@ -147,8 +147,8 @@ def neighbours(images: PosedImages, i: int, keys: Sequence[int]) -> list[int]:
 
 
 def key_images(images: PosedImages, points_of: Callable[[int], NDArray[np.float64]], spacing: float) -> list[int]:
-    """Images as far apart, in their order, as can be with points at most ``spacing`` (median, in widths) from where the
-    last one shows them: all, but for those of a video that follow closely."""
+    """Key images: the fewest, in order, whose points are displaced by at most ``spacing`` (median, in widths) from the
+    previous one; all images, unless they are dense as in a video."""
 
     def shift(i: int, j: int) -> float:
         points = points_of(i)
@@ -172,14 +172,14 @@ def share_known(shot: Shot) -> float:
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:
-    """A mask of an image's view as a mask of the image itself, lens included.
+    """A mask of an image's undistorted view as a mask of the image itself.
 
     Args:
         view: the image at working size.
         mask: of the view.
         images: the originals.
         i: the image's place in them.
-        shape: height and width that are asked for; the image may be a copy of another size.
+        shape: height and width of the result; the image may be a copy of another size.
     """
     x, y = straightened(images, i, shape)
     fx, fy, cx, cy = view.pinhole
@@ -192,7 +192,7 @@ def moving_masks(
     seen_by: NDArray[np.integer],
     points: NDArray[np.float64],
 ) -> tuple[Sequence[Mask], str]:
-    """What moves in each image [H, W], and the doubt of ``find_moving``, from the cache if possible.
+    """Masks of moving objects in each image [H, W], and the doubt of ``find_moving``, from the cache if possible.
 
     Args:
         images: the originals.
@@ -202,7 +202,7 @@ def moving_masks(
     """
 
     def find() -> Arrays:
-        deque(in_order(_decode, images.files), maxlen=0)  # names a damaged one, of which OpenCV would print warnings
+        deque(in_order(_decode, images.files), maxlen=0)  # names a damaged file, for which OpenCV would print warnings
         forecast = duration(SECONDS * len(shapes) / num_threads())
         CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {forecast}.")
         views, masks, doubt = find_moving(
@@ -229,7 +229,7 @@ def _decode(file: Path) -> None:
 
 
 def share_of_moving(masks: Sequence[Mask]) -> str:
-    """How much of the training images moves, in one sentence."""
+    """Share of moving pixels in the training images, as a sentence."""
     shares = np.array([mask.mean() for mask in masks])
     if not shares.any():
         return "Nothing is seen to move in the training images"
@@ -241,12 +241,12 @@ def share_of_moving(masks: Sequence[Mask]) -> str:
 
 
 def draw_moving(path: Path, files: Sequence[Path], masks: Sequence[Mask]) -> None:
-    """Writes the images in which most moves, in order, with what moves in red.
+    """Writes the images with most moving pixels, in order, with masks in red.
 
     Args:
         path: file of the picture; its folder is made.
         files: of the images.
-        masks: what moves in each image [H, W]; something in at least one.
+        masks: of moving objects in each image [H, W]; not all empty.
     """
     shares = [float(mask.mean()) for mask in masks]
     tiles = []
@@ -269,8 +269,8 @@ def draw_moving(path: Path, files: Sequence[Path], masks: Sequence[Mask]) -> Non
 
 
 def gain_of(shot: Shot, other: Shot) -> NDArray[np.float64]:
-    """What the blue, green and red of another shot are multiplied by for the exposure of this one, by what both show
-    at one depth. [3]"""
+    """Gains of blue, green and red that bring another shot to the exposure of this one, from pixels of equal depth.
+    [3]"""
     rows, columns = np.nonzero(shot.depth.inverse)
     some = np.s_[:: max(1, len(rows) // SAMPLES)]
     rows, columns = rows[some], columns[some]
@@ -291,29 +291,29 @@ def gain_of(shot: Shot, other: Shot) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class _Look:
-    """What an image shows."""
+    """State of an image in the search."""
 
     gains: list[NDArray[np.float64]]
-    """Of its neighbours. [3] each"""
+    """Gains of its neighbours. [3] each"""
     swept: Sweep
     levels: NDArray[np.int16]
     """Of ``seeds``. [h, w]"""
     shown: Evidence
     core: Mask
-    """What moves for certain, of which objects grow. [h, w]"""
+    """Pixels that certainly move, from which objects grow. [h, w]"""
 
 
 def _others(
     shots: Sequence[Shot], near: Sequence[int], i: int, gains: Sequence[NDArray[np.float64]]
 ) -> list[Neighbour]:
-    """The neighbours of an image, at its exposure."""
+    """Neighbours of an image, at its exposure."""
     return [Neighbour.of(shots[i], shots[j], gain) for j, gain in zip(near, gains, strict=True)]
 
 
 def _moves(
     shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], uprights: Mask, first: _Look | None
 ) -> tuple[Mask, _Look]:
-    """What an image itself shows to move, given what moves in others and where it shows objects of theirs."""
+    """Moving pixels of an image by its own evidence, given the masks of others and where it sees their objects."""
     shot = shots[i]
     gains = first.gains if first else [gain_of(shot, shots[j]) for j in near]
     others = _others(shots, near, i, gains)
@@ -333,9 +333,9 @@ def _followed_on(
     looks: dict[int, _Look],
     pool: ThreadPoolExecutor,
 ) -> list[Mask]:
-    """Masks [h, w] with what is followed from them to the images that were looked at again: by optical flow and along
-    the path, and on along it from image to image where objects enter or leave images at the side. What is followed
-    joins the seeds in ``looks``."""
+    """Masks [h, w] with objects that are tracked into the images of the second pass: by optical flow and along the
+    path, and on along it from image to image where objects enter or leave images at the side. Tracked objects join the
+    seeds in ``looks``."""
 
     def followed_to(part: Iterable[int], some_of: Callable[[int], Mask]) -> list[Mask]:
         def whole(i: int) -> Mask:
@@ -382,7 +382,7 @@ def _outlined(
     looks: dict[int, _Look],
     pool: ThreadPoolExecutor,
 ) -> list[Mask]:
-    """Masks [h, w] with better outlines, in the images that were looked at again."""
+    """Masks [h, w] with better outlines, in the images of the second pass."""
 
     def outline(i: int) -> Mask:
         others = _others(shots, near[i], i, looks[i].gains)

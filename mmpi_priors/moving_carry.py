@@ -1,11 +1,11 @@
-"""What moves along the camera's path, followed into images in which too few neighbours show what is behind it.
+"""Tracking of objects that move along the camera's path, into images where too few neighbours see the background.
 
-A car that leaves an image at the side, or has just entered it, is large there, moves across much of the image from one
-to the next, and hides what no other image shows. But as it moves parallel to the path, it has one inverse depth in all
-images, if a false one (``moving_sweep.py``). So what moves in a neighbour is searched at inverse depths from behind the
-camera to beyond the nearest content, by correlation at half the size. It counts where it is clearly more alike than
-anything that stands in any neighbour, at a depth that something static may have. Paint has no texture of its own, so
-pixels that move are scattered over a car; one that is not masked yet is taken as a whole.
+A car that leaves or enters an image at the side is large there, moves across much of the image from one to the next,
+and occludes what no other image sees. As it moves parallel to the path, it has one apparent inverse depth in all images
+(``moving_sweep.py``). So the moving pixels of a neighbour are searched at inverse depths from behind the camera to
+beyond the nearest content, by correlation at half the size. A match counts where its correlation clearly exceeds that
+of all static content of the neighbours at possible depths. Paint has no texture, so matches are scattered over a car;
+one that is not masked yet is filled as a whole.
 """
 
 from __future__ import annotations
@@ -24,42 +24,41 @@ from mmpi_priors.ops.likeness import Likeness, most_alike
 from mmpi_priors.views import Map
 
 AFTER, STATIC = 2, 4
-"""Nearest neighbours from which what moves is followed, and whose static content is compared."""
+"""Nearest neighbours from which objects are tracked, and whose static content is compared."""
 BEHIND, BEYOND, DEPTHS = -0.5, 2.0, 72
-"""Inverse depths, from the first to the second multiple of the nearest content's: what comes towards the camera seems
-nearer than it is."""
+"""Range of inverse depths as multiples of the nearest content's: approaching objects appear nearer than they are."""
 GROUND, MARGIN, REACH = 0.9, 0.02, 1.2
-"""Static content has at least this multiple of the ground's inverse depth less this multiple of the nearest content's,
-and at most this multiple of that."""
+"""Inverse depth of static content: at least the first multiple of the ground's less the second of the nearest
+content's, at most the third of the nearest content's."""
 BETTER = 0.1
-"""Correlation of what moves over that of what stands, at least: one neighbour shows each."""
+"""Minimum difference of the correlations of moving and static content, each from one neighbour."""
 COHERENT = 1.1
 """Steps by which an inverse depth may differ from the median around it."""
 SCATTERED, CLOSED, LEAST_PIXELS = 3.0, 13, 450
-"""The same within a whole object, pixels across which what moves there is one, and those of an object, at half the
+"""The same within a whole object; gap across which its moving pixels are joined; minimum size of an object; at half the
 size."""
 NEW, UP = 0.5, 0.2
-"""Share of an object that is masked already, at most, for it to be another one; and how far below the horizon its
-highest pixel lies, over its lowest, at most: what moves by the camera is nearly as high as it."""
+"""Maximum share of a new object that is already masked; maximum ratio of the distances below the horizon of its highest
+and its lowest pixel: objects that pass the camera are nearly as high as it."""
 
 
 @dataclass(frozen=True)
 class Carried:
-    """The inner part of what a shot shows of what moves in its nearest neighbours. [h, w] each"""
+    """Inner part of the objects of the nearest neighbours in a shot. [h, w] each"""
 
     pixels: Mask
     objects: Mask
-    """Whole ones that are not masked yet."""
+    """Whole objects that are not masked yet."""
 
 
 def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], mask: Mask) -> Carried:
-    """What moves in the nearest neighbours of a shot, where the shot shows it.
+    """Objects that move in the nearest neighbours of a shot, at their positions in the shot.
 
     Args:
         shot: the image.
         others: its neighbours, nearest first.
-        masks: what moves in each. [h, w]
-        mask: what moves in the shot, as far as is known. [h, w]
+        masks: of moving objects in each. [h, w]
+        mask: of moving objects in the shot so far. [h, w]
     """
     nothing, measured = np.zeros(shot.view.gray.shape, bool), shot.depth.inverse[shot.depth.inverse > 0]
     if shot.ground is None or not len(measured) or not any(mask.any() for mask in masks[:AFTER]):
@@ -87,17 +86,17 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], mask
     enlarged = (
         cv2.resize(part.astype(np.uint8), nothing.shape[::-1], interpolation=cv2.INTER_NEAREST) for part in parts
     )
-    # Windows reach beyond what moves.
+    # Windows reach beyond the objects.
     return Carried(*(cv2.erode(part, np.ones((INSIDE, INSIDE), np.uint8)) > 0 for part in enlarged))
 
 
 def whole_objects(moves: Mask, ground: Map, masked: Mask) -> Mask:
-    """Large objects, not masked yet, on which pixels that move are scattered, as paint has no texture. [h, w]
+    """Large objects, not masked yet, with scattered moving pixels (paint has no texture). [h, w]
 
     Args:
         moves: pixels that move. [h, w]
         ground: inverse depth of the ground, 0 near the horizon and above. [h, w]
-        masked: what is known to move. [h, w]
+        masked: moving objects so far. [h, w]
     """
     around = np.pad(moves.astype(np.uint8), CLOSED)
     closed = cv2.morphologyEx(around, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSED, CLOSED)))

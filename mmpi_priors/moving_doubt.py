@@ -1,4 +1,4 @@
-"""Whether a drive may show cars that keep their distance without their being masked."""
+"""Check whether a drive may contain cars at constant distance that are not masked."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from mmpi_priors.moving_sweep import is_straight
 from mmpi_priors.views import pixel_grid
 
 ENOUGH = 100
-"""Pixels of known depth below the horizon from which a shot tells how far the road is below the camera."""
+"""Minimum number of pixels with a depth below the horizon for a shot to measure the height of the camera above the
+road."""
 ALIKE, ROAD, DEEP = 0.2, 0.3, 1.0
-"""Logarithms of that height that agree, share of what shots tell that must agree on the road, and logarithm from which
-on something lies deep below it."""
+"""Tolerance of the log height, minimum share of measurements that agree on the road, and log ratio from which a point
+lies far below it."""
 SUNK = 0.1
-"""Share that lies deep below the road from which masks are doubtful. Captures that are masked well have 0 to 0.04, a
-motorway with two cars ahead 0.28."""
+"""Share of points far below the road from which masks are doubtful. Captures with good masks have 0 to 0.04, a motorway
+with two cars ahead 0.28."""
 GROUNDS, AHEAD, MANY = 0.25, 0.8, 8
-"""Share of the shots in which a ground is found: a drive of fewer is doubtful. Cosine between the directions of a drive
-and its steps, half of them at least. Of fewer shots than the last nothing is said."""
+"""Minimum share of shots with a detected ground; minimum median cosine between viewing directions and steps of a drive;
+minimum number of shots for a doubt."""
 LONG, STEADY = 8.0, 0.9999
-"""A drive's path is at least so many times as long as its camera is above the road (a drone is far above what it flies
-over); a car turns its camera so little from image to image, as a cosine, half of the times at least (a hand turns it
-by degrees from step to step)."""
+"""Minimum ratio of path length and camera height of a drive (a drone is higher); minimum median cosine of the rotation
+between images (a hand-held camera turns by degrees at each step)."""
 
 
 def doubt_of(shots: Sequence[Shot], up: NDArray[np.float64], masks: Sequence[Mask]) -> str:
-    """A sentence that says why masks of a drive are doubtful; empty if they are not, or if nothing shows that this is a
-    drive: a camera that looks along its path, turns as little as a car, and is close above a road if it shows one.
+    """Sentence on why masks of a drive are doubtful; empty if they are not, or if the capture is not a drive: a camera
+    that looks along its path, turns as little as a car, and is close above a road if it sees one.
 
     Args:
         shots: of the capture.
         up: unit vector in the world. [3]
-        masks: what is masked. [h, w] each
+        masks: of the shots. [h, w] each
     """
     if len(shots) < MANY:
         return ""
@@ -62,9 +62,8 @@ def doubt_of(shots: Sequence[Shot], up: NDArray[np.float64], masks: Sequence[Mas
 
 
 def share_sunk(shots: Sequence[Shot], up: NDArray[np.float64], masks: Sequence[Mask]) -> tuple[float, float]:
-    """Share of what is measured below the horizon, in all shots, that seems to lie deep below the road, and how far the
-    road, which is as far below all cameras of a drive, is below them; 0 where none stands out. Arguments are those of
-    ``doubt_of``."""
+    """Share of the points below the horizon, in all shots, that lie far below the road, and the height of the cameras
+    above the road, which is constant on a drive; 0 if none stands out. Arguments are those of ``doubt_of``."""
     heights = [np.zeros(0)]
     for shot, mask in zip(shots, masks, strict=True):
         x, y = pixel_grid(shot.view.gray.shape)

@@ -1,9 +1,9 @@
-"""People who move, followed from image to image by what they look like.
+"""Tracking of people from image to image by template matching.
 
-Somebody who walks ahead of the camera looks like a static thing far away, and optical flow is lost where the camera
-turns. There, objects that are taller than wide are searched around their place in images that are turned alike, at a
-few sizes, by normalised correlation (``cv2.matchTemplate``) at half the size. What is seen there moves if no depth that
-something static can have brings it there, and counts if it was seen to move in two images.
+A person who walks ahead of the camera looks like a distant static object, and optical flow fails where the camera
+turns. There, tall objects of neighbouring images are tracked by template matching after rotation compensation, at a few
+scales and half the size (``cv2.matchTemplate``). A match moves if no possible static depth projects it there, and
+counts if it moves in two images.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from mmpi_priors.moving_evidence import SOLID, Bytes, Mask, Shot, Warp, turned
 from mmpi_priors.views import View
 
 AFTER = 4
-"""Nearest neighbours from which objects are followed, if the camera turned to one of them."""
+"""Nearest neighbours from which objects are tracked, if the camera turned relative to one of them."""
 ASIDE, UP = 0.12, 0.05
-"""Places around its own in which an object is searched, in widths of the image."""
+"""Search radius around the position of an object, in widths of the image."""
 SIZES = (0.87, 1.0, 1.15)
-"""Over its size in the neighbour, at which an object is searched."""
+"""Scales relative to the neighbour at which an object is searched."""
 ALIKE = 0.75
-"""Correlation of colours from which an object is seen."""
+"""Minimum correlation of colours for a match."""
 LEAST_AREA, LEAST_SIDE = 30, 4
-"""Pixels of an object and of its width, at least."""
+"""Minimum number of pixels and minimum width of an object."""
 DEPTHS, REACH, APART = 24, 1.2, 1.5
-"""Inverse depths that something static may have, up to this multiple of the nearest content's, and pixels between where
-they put an object and where it was, from which on it moves."""
+"""Maximum inverse depth of static objects, as a multiple of the nearest content's; and minimum distance, in pixels, of
+a moving object from its possible static positions."""
 INNER = 2
 """Pixels across which an object is shrunk at half the size: its outline is uncertain."""
 AGAIN = 0.5
-"""Share of what is followed that is masked anyway in one image, at least: what is seen to move once may be wrong."""
+"""Minimum share of a tracked object that is masked independently in some image: a single detection may be wrong."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Half:
 def upright_objects(
     shots: Sequence[Shot], near: Sequence[Sequence[int]], masks: Sequence[Mask], pool: ThreadPoolExecutor
 ) -> list[Mask]:
-    """Where each shot shows what moves in others and is taller than wide, but for the outline. [h, w] each
+    """Tall objects that move in other shots, at their positions in each shot, without their outlines. [h, w] each
 
     Args:
         shots: the images.
         near: the neighbours of each, nearest first.
-        masks: what moves in each. [h, w]
+        masks: of moving objects in each. [h, w]
         pool: for several images at a time.
     """
     result = [np.zeros_like(mask) for mask in masks]
@@ -97,7 +97,7 @@ def upright_objects(
 
 
 def objects_in(shot: Half, other: Half) -> list[tuple[int, Mask]]:
-    """The objects of another image that a shot shows: their numbers there, and where. [h, w] each"""
+    """Objects of another image that a shot sees: their numbers there, and their masks in the shot. [h, w] each"""
     height, width = shot.view.gray.shape
     warp = Warp.between(shot.view, other.view)
     x, y, ahead = warp.places(np.zeros((height, width), np.float32))
@@ -120,7 +120,7 @@ def objects_in(shot: Half, other: Half) -> list[tuple[int, Mask]]:
         outline = cv2.resize(shape.astype(np.uint8), None, fx=size, fy=size, interpolation=cv2.INTER_NEAREST)
         before = np.array([columns.mean(), rows.mean()])
         middle = (before - (left, top)) * size + (first, above)
-        # Something static at one of the depths that it can have may be there and here.
+        # A static object at a possible depth may explain both positions.
         last = np.array([width - 1, height - 1])
         (column, row), was = (np.clip(at, 0, last).astype(int) for at in (middle, before))
         least = SOLID * float(shot.ground[min(above + len(outline), height) - 1, column])
@@ -138,10 +138,10 @@ def objects_in(shot: Half, other: Half) -> list[tuple[int, Mask]]:
 
 
 def search(image: Bytes, color: Bytes, shape: Mask, corner: tuple[int, int]) -> tuple[float, int, int] | None:
-    """The size of an object over what it was, and the column and row of its box in an image; None if it is not seen.
+    """Scale of an object, and column and row of its box in an image; None if it is not seen.
 
     Args:
-        image: in which it is searched. [h, w, 3]
+        image: to search. [h, w, 3]
         color: the box with the object. [b, c, 3]
         shape: the object in the box. [b, c]
         corner: column and row of the box, turned like the image.

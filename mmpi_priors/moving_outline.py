@@ -1,9 +1,8 @@
-"""Outlines of what moves, once it is roughly known in all images.
+"""Outlines of moving objects, from rough masks in all images.
 
-Objects grow along edges of an image, so they reach on to what stands beside them and of which neighbours show nothing
-new: between two cars, on the road around them, on a parked car behind. But without what moves in the neighbours, a
-static scene explains all that stands, at a depth that it may have, and little of what moves: so what it explains leaves
-a mask from outside, and what it does not, next to a mask, joins it.
+Segments grow along image edges and include static surfaces beside an object: between two cars, on the road, on a parked
+car behind. With the moving objects of the neighbours masked, static pixels match them at some possible depth and moving
+ones hardly do. So matched pixels are removed from a mask, from outside, and unmatched ones next to a mask are added.
 """
 
 from __future__ import annotations
@@ -17,28 +16,29 @@ from mmpi_priors.moving_evidence import ALL, Bytes, Mask, Neighbour, Shot, least
 from mmpi_priors.moving_objects import filled, touching
 
 EXPLAINED, UNLIKE = 1.0, 8.0
-"""Levels beyond the image's noise up to which one neighbour explains a pixel, and from which none does."""
+"""Gray levels above the image's noise up to which a pixel matches a neighbour, and from which it matches none."""
 OVER, LEVEL = 8, 3
-"""Pixels above the highest seed of a column and below the horizon from which on nothing leaves a mask: roofs and heads
-of what is as high as the camera stand before what hardly shifts from image to image."""
+"""Distances above the highest seed of a column and below the horizon beyond which nothing leaves a mask, pixels: behind
+roofs and heads at camera height the background hardly shifts between images."""
 CLOSED, OPENED, AROUND = 5, 3, 9
-"""Pixels across which what is left is closed and what joins is opened, and around a mask in which it may lie."""
+"""Sizes of the closing of what remains and the opening of what joins, and distance from a mask at which pixels may
+join, pixels."""
 REACH = AROUND + 8
-"""Pixels around all masks of an image in which it is compared: what joins, a pixel of margin, and windows."""
+"""Margin around all masks of an image within which it is compared, pixels."""
 
 
 def outlined(
     shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], mask: Mask, core: Mask, noise: float
 ) -> Mask:
-    """A mask without what a static scene explains around its seeds, and with what it does not explain next to it.
+    """A mask without the pixels around its seeds that match the static scene, and with those next to it that do not.
 
     Args:
         shot: the image.
         others: its neighbours.
-        masks: what moves in each. [h, w]
-        mask: what moves in the shot. [h, w]
-        core: seeds, which stay; so do objects without any. [h, w]
-        noise: levels by which surfaces differ from what explains them.
+        masks: of moving objects in each. [h, w]
+        mask: of moving objects in the shot. [h, w]
+        core: seeds, which remain; so do objects without any. [h, w]
+        noise: gray levels by which static surfaces differ from their matches.
     """
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     box = np.s_[max(y - REACH, 0) : y + height + REACH, max(x - REACH, 0) : x + width + REACH]
@@ -56,7 +56,7 @@ def outlined(
     joins = near & (unlike > noise + UNLIKE) & (unlike < ALL)
     both = cv2.morphologyEx((left | joins).astype(np.uint8), cv2.MORPH_OPEN, _disc(OPENED)) > 0
     shown = filled(touching(both | left, left))
-    # Pixels along an outline mix what is on both sides of it.
+    # Pixels along an outline mix both sides.
     return shown | ((cv2.dilate(shown.astype(np.uint8), _disc(3)) > 0) & (unlike >= noise + EXPLAINED))
 
 

@@ -1,9 +1,9 @@
-"""What moves along with the camera or towards it, by depths that nothing static can have.
+"""Detection of objects that move parallel to the camera, by apparent depths that are impossible for static points.
 
-Something that moves parallel to the camera's path looks like a static thing at a wrong inverse depth: its own times
-1 - v, with v its speed over the camera's. A car ahead that keeps its distance seems infinitely far, below the road; one
-that overtakes seems to lie behind the camera; one that comes towards it seems nearer and smaller than it is, so that it
-hangs in the air. So a shot is compared with its neighbours at inverse depths that reach below 0, at half its size.
+An object that moves parallel to the camera's path looks like a static one at the inverse depth (1 - v) q, with q its
+own and v its speed relative to the camera's. A car ahead at constant distance appears infinitely far, below the road;
+one that overtakes appears behind the camera; an approaching one appears nearer and smaller than it is, floating in the
+air. So a shot is compared with its neighbours at inverse depths that reach below 0, at half its size.
 """
 
 from __future__ import annotations
@@ -24,44 +24,46 @@ from mmpi_priors.views import Map, Parallax, View
 NEIGHBOURS = 4
 """Nearest neighbours that are compared; the mean of the two best correlations counts at each depth."""
 NEGATIVE, POSITIVE, REACH = 24, 48, 1.2
-"""Inverse depths behind the camera and before it, up to this multiple of the nearest content's; half of it behind."""
+"""Number of inverse depths behind and in front of the camera, up to this multiple of the nearest content's; half of it
+behind."""
 BELOW, MARGIN = 0.6, 0.02
 """An inverse depth is impossible below this multiple of the ground's less this multiple of the largest."""
 ALIKE, BETTER, CONTRAST = 0.8, 0.15, 3.0
-"""Correlation at an impossible depth, what it has over the best possible one, and standard deviation of gray levels
-around a pixel, at least, for the pixel to move."""
+"""Minimum correlation at an impossible depth, its margin over the best possible one, and minimum standard deviation of
+gray levels, for a moving pixel."""
 COHERENT = 1.1
-"""Steps by which the impossible depth may differ from the median around it: chance makes scattered ones."""
+"""Maximum difference of an impossible depth from the median around it, in steps: random matches scatter."""
 SMOOTH, LEAST_PIXELS, STANDS = 5, 30, 0.3
-"""Pixels across which most must move, pixels of what moves, and share of them below the horizon, at half the size."""
+"""Window in which most pixels must move, minimum size of an object, and its minimum share below the horizon, at half
+the size."""
 INSIDE = 11
-"""Pixels across which all must move, at the size of the shot: windows reach beyond what moves."""
+"""Size of the erosion at full size: windows reach beyond the object."""
 MEASURED, MEASURED_CONTRAST = 0.7, 2.0
-"""Correlation and contrast from which a depth is taken for what hangs in the air."""
+"""Minimum correlation and contrast of depths of floating objects."""
 FLOATS = 1.4
-"""Inverse depth of a thing over that of the ground just below it, at least, for it to hang in the air."""
+"""Minimum ratio of the inverse depths of a floating object and the ground just below it."""
 EDGE, PIECE = 1.25, 20
-"""Factor by which inverse depths next to each other differ at the edge of a thing, and pixels of one, at least."""
+"""Factor between adjacent inverse depths at the edge of an object, and minimum size of one."""
 GAP, ON_GROUND, BARE = 12, 0.2, 0.6
-"""Pixels below it in which the first measured depth must be the ground's but for this share, and share of its columns
-where it is."""
+"""Distance below it within which the first measured depth must be the ground's, relative tolerance, and minimum share
+of its columns."""
 STRAIGHT = 0.05
-"""Distance of cameras from a straight line over the length of their path, at most: else depths are what they seem."""
+"""Maximum distance of the cameras from a straight line, relative to the length of their path."""
 FAR = 1e30
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Where a shot shows what moves parallel to the camera's path. [h, w] each"""
+    """Pixels of objects that move parallel to the camera's path. [h, w] each"""
 
     impossible: Mask
-    """Neighbours look alike at a depth below the ground or behind the camera, and at no possible one."""
+    """Pixels that match at a depth below the ground or behind the camera, and at no possible one."""
     certain: Mask
-    """The inner part of it, and what hangs in the air."""
+    """The inner part of it, and floating objects."""
 
 
 def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
-    """Compares a shot with its neighbours at depths that static things may have, and at others."""
+    """Plane sweep of a shot against its neighbours, at possible and impossible depths."""
     nothing, measured = np.zeros(shot.view.gray.shape, bool), shot.depth.inverse[shot.depth.inverse > 0]
     if shot.ground is None or not len(measured) or len(others) < 2:
         return Sweep(nothing, nothing)
@@ -89,7 +91,7 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
 
 
 def compared(view: View, others: Sequence[View], masks: Sequence[Mask] | None = None) -> Others:
-    """Other views, and as marks what moves in them, as a view is compared with them (``most_alike``)."""
+    """Other views with their moving objects as marks, for ``most_alike``."""
     images = []
     for other, mask in zip(others, masks or [np.zeros((1, 1), bool)] * len(others), strict=True):
         moving = cv2.resize(mask.astype(np.uint8), other.gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -100,7 +102,7 @@ def compared(view: View, others: Sequence[View], masks: Sequence[Mask] | None = 
 
 
 def solid(moves: Mask, ground: Map) -> Mask:
-    """What moves without specks, lines, and what does not reach below the horizon. [h, w]"""
+    """Moving pixels without specks, lines and objects that do not reach below the horizon. [h, w]"""
     filled = cv2.boxFilter(moves.astype(np.float32), -1, (SMOOTH, SMOOTH)) > 0.5
     number, labels, boxes, _ = cv2.connectedComponentsWithStats(filled.astype(np.uint8))
     stands = np.bincount(labels.ravel(), (ground > 0).ravel(), number) / boxes[:, cv2.CC_STAT_AREA]
@@ -110,24 +112,24 @@ def solid(moves: Mask, ground: Map) -> Mask:
 
 
 def is_straight(views: Sequence[View]) -> bool:
-    """Whether cameras stand on a straight line: then one thing that moves along it has one false depth in all."""
+    """Whether cameras stand on a straight line: an object that moves along it then has one apparent depth in all."""
     centers = np.stack([view.pose[:, 3] for view in views])
     sizes = np.linalg.svd(centers - centers.mean(0), compute_uv=False)
     return len(centers) >= 3 and bool(sizes[1] <= STRAIGHT * sizes[0])
 
 
 def floats(inverse: Map, ground: Map) -> Mask:
-    """What seems to hang in the air, as a car does that comes towards the camera: nearer than it is, and smaller.
+    """Objects that appear to float, as an approaching car does: nearer than it is, and smaller.
 
     Args:
-        inverse: inverse depth, 0 or less where unknown. [h, w]
+        inverse: inverse depth, 0 or less where there is none. [h, w]
         ground: inverse depth of the ground, 0 near the horizon and above. [h, w]
     """
     result = np.zeros(inverse.shape, bool)
     inverse = np.asarray(cv2.medianBlur(np.maximum(inverse, 0), 5), np.float32)
     kernel = np.ones((3, 3), np.uint8)
     smallest = cv2.erode(np.where(inverse > 0, inverse, FAR).astype(np.float32), kernel)
-    whole = (inverse > 0) & (cv2.dilate(inverse, kernel) < EDGE * smallest)  # things end where depth jumps
+    whole = (inverse > 0) & (cv2.dilate(inverse, kernel) < EDGE * smallest)  # objects end where depth jumps
     on_ground = np.abs(inverse - ground) < ON_GROUND * ground
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(((inverse > FLOATS * ground) & whole).astype(np.uint8))
     for label in np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] >= PIECE)[1:]:

@@ -1,8 +1,8 @@
 """Rays of new views: from positions between two training cameras that see the same point.
 
-A point that two images show with the same colour and depth is visible from everywhere between their cameras, unless an
-object between them hides it. Its colour there lies between those of the two images. Such rays supervise the colour of a
-new view and, since they end at the point, the empty space in front of it, which removes floaters.
+A point that two images see with the same colour and depth is visible from every position between their cameras, unless
+an object between them occludes it. Its colour there lies between those of the two images. Such rays supervise the
+colour of a new view and, since they end at the point, the empty space in front of it, which removes floaters.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mmpi_priors.dense import TRIMMED
 from mmpi_priors.views import look_up, project
 
 NEIGHBOURS = 4
-"""Number of cameras, the nearest facing the same way, in which a point of an image is searched."""
+"""Number of cameras, the nearest facing the same way, into which a point of an image is projected."""
 MAX_ANGLE = 60.0
 """Maximum angle in degrees between the viewing directions of two cameras with new views between them."""
 CERTAIN = 0.03
@@ -65,7 +65,7 @@ class ShownImage:
     def shows(
         self, posed: PosedImages, j: int, points: Float[ndarray, "P 3"], colors: Float[ndarray, "P C"]
     ) -> tuple[Int[ndarray, "S"], UInt8[ndarray, "S C"]]:
-        """Numbers and colours of the points that image j, this one, shows at their distance, coloured alike."""
+        """Indices and colours of the points that this image, j, sees at their distance and with their colour."""
         at = project(posed, j, points)
         maps = self.depth[..., 0], self.usable, self.darkest, self.brightest
         inverse, may, darkest, brightest = (look_up(m, *at.T, nearest=True) for m in maps)
@@ -86,12 +86,12 @@ def find_shared_points(
     device: str | torch.device = "cpu",
     exposures: Float[Tensor, "M 3"] | None = None,
 ) -> SharedPoints | None:
-    """The points that two of the training ``images``, by number, show at the same depth; None if there are none.
+    """The points that two of the training ``images``, by number, see at the same depth; None if there are none.
 
     ``seed`` chooses among more than ``MOST`` pixels. ``exposures`` are those of all training images, by which colours
     are divided; None: they are equal. Raises InputError naming an image or mask that cannot be used.
     """
-    # Neighbours mostly stand side by side.
+    # Neighbouring cameras mostly have neighbouring numbers.
     show = held(
         lambda i: ShownImage.of(*image_and_mask(dataset, i), depths.image(i)),
         posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1,
@@ -121,9 +121,10 @@ def _matches(
     seed: int,
     exposures: Float[Tensor, "M 3"] | None,
 ) -> tuple[list[tuple[Tensor, ...]], float]:
-    """Points that image i shares with its neighbours among others, each as the first four fields of ``SharedPoints``.
+    """Points that image i shares with its neighbours among ``others``, as the first four fields of ``SharedPoints``.
 
-    Its pixels of certain depth are compared, ``most`` at most; second comes the number of matches that all would have.
+    At most ``most`` of its pixels with a certain depth are compared. The second result is the estimated number of
+    matches of all of them.
     """
     shown = show(i)
     inverse, error = shown.depth[..., 0], shown.depth[..., 1]

@@ -1,4 +1,4 @@
-"""Observations of a data set for placement: cameras, points, and which camera saw which point."""
+"""Observations of a data set for placement: cameras, points, and which camera sees which point."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ MAX_REPROJECTION = 0.02
 POSES_OFF = 0.5
 """Error of the poses, in training pixels, above which it is reported."""
 ENOUGH_KEYPOINTS = 20
-"""Average number of keypoints in an image above which no surfaces need to be searched."""
+"""Average number of keypoints in an image above which no surfaces need to be estimated."""
 SEARCHED, SEARCHED_SIDE = 16, 220
-"""Views whose surfaces are searched, evenly spread over the capture, and pixels of their longer side."""
+"""Views in which surfaces are estimated, evenly spread over the capture, and pixels of their longer side."""
 SEARCH_NEAR, SEARCH_ANGLE = (4, 8), 30.0
-"""Nearest views that such a view is compared with, and which count as seeing its points; the largest angle in degrees
-between their directions."""
+"""Nearest views that such a view is compared with and that observe its points; the largest angle in degrees between
+their directions."""
 SEARCH_ERROR = 0.5
-"""Largest relative error of a point: what is so far that it hardly moves must not be left out."""
+"""Largest relative error of a point; large, so that distant content with little parallax is kept."""
 POINTS_PER_VIEW = 400
 """Points on the surfaces of such a view, about."""
 
@@ -95,9 +95,9 @@ def _find_points(
     triangulates: bool,
     check: Callable[[PosedImages, SfmModel], bool],
 ) -> Observations:
-    """Points of a scene without tracks: triangulated, and on searched surfaces if triangulation finds too few.
+    """Points of a scene without tracks: triangulated, and on estimated surfaces if these are too few.
 
-    ``check`` tells whether cameras were found to contradict the matches, after it said so."""
+    ``check`` returns whether the cameras contradict the matches, after printing it."""
     images = posed_images(observations, dataset)
     if images is None:
         CONSOLE.print("Cameras that are neither perspective nor fisheye: no features are matched.")
@@ -123,8 +123,8 @@ def _find_points(
 
 
 def with_surfaces(observations: Observations, images: PosedImages) -> Observations:
-    """The observations with points on surfaces of some views, which are searched at a low resolution (``patches.py``).
-    Points, each seen by its view and every near one it falls on, follow earlier ones."""
+    """The observations with points on surfaces of some views, estimated at a low resolution (``patches.py``). Points
+    follow the earlier ones; each is observed by its view and by every near view that it projects into."""
     poses, count = observations.camera_to_worlds, len(images.files)
     points, seen_by, seen_point = [observations.points], [observations.seen_by], [observations.seen_point]
     for i in np.unique(np.linspace(0, count - 1, min(SEARCHED, count)).round().astype(int)).tolist():
@@ -153,7 +153,7 @@ def with_surfaces(observations: Observations, images: PosedImages) -> Observatio
 
 
 def file_matrices(observations: Observations, outputs: DataparserOutputs, folder: Path) -> Array:
-    """The cameras' matrices as they are in transforms.json, before the data parser moved and scaled them. [M, 4, 4]"""
+    """The cameras' matrices of transforms.json, before the data parser's transform. [M, 4, 4]"""
     moved = outputs.dataparser_transform.double().numpy()
     with suppress(OSError, ValueError, KeyError):  # another parser, or a file without it
         applied = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))["applied_transform"]
@@ -167,9 +167,9 @@ def file_matrices(observations: Observations, outputs: DataparserOutputs, folder
 
 
 def check_cameras(matrices: Array, images: PosedImages, model: SfmModel, *, trusts: bool) -> bool:
-    """Whether cameras contradict verified matches, said in a sentence with the convention that explains them.
+    """Whether cameras contradict verified matches; prints it with the convention that fits them.
 
-    Raises InputError with this sentence where they cannot be used, unless they are to be trusted."""
+    Raises InputError with the same sentence if they cannot be used and ``trusts`` is False."""
     table, width = model.matches, images.sizes[:, 0]
     pairs = Matches(table[:, :2].astype(np.int64), *(table[:, c : c + 4].reshape(-1, 2, 2) for c in (2, 6)))
     lens = images.intrinsics[:, 0] / width, images.intrinsics[:, :2], images.intrinsics[:, 2:]
@@ -200,8 +200,8 @@ def check_cameras(matrices: Array, images: PosedImages, model: SfmModel, *, trus
 
 
 def tell_poses(off: float, image: Path) -> None:
-    """Reports poses from which matches or keypoints are off by this many training pixels (median), with the command
-    that refines them, for one of the training images."""
+    """Reports poses that matches or keypoints contradict by this many training pixels (median), with the command that
+    refines them; ``image`` is one of the training images."""
     if not off > POSES_OFF:  # or not a number, as nothing matched
         return
     full = image.parent.with_name(re.sub(r"_\d+$", "", image.parent.name))  # images for images_2
@@ -214,8 +214,8 @@ def tell_poses(off: float, image: Path) -> None:
 def read_observations(
     outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None, cloud: Array | None = None
 ) -> Observations:
-    """Training cameras as they are used, with the SfM points and keypoints moved into their frame, and the points of a
-    cloud [P, 3]. Raises InputError naming the image whose pose or intrinsics cannot be used."""
+    """Training cameras in the scene's frame, with the SfM points and keypoints in it, and the points of a cloud [P, 3].
+    Raises InputError naming the image whose pose or intrinsics cannot be used."""
     observations = camera_observations(cameras, outputs.image_filenames)
     if cloud is not None and len(loose := usable_points(cloud, observations.centers)):
         observations = replace(observations, loose=loose)

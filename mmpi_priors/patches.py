@@ -1,9 +1,9 @@
-"""Depths of a view at a low resolution: patches of planes that make its neighbours look like it.
+"""Depths of a view at a low resolution by PatchMatch stereo: slanted patches that agree with its neighbours.
 
-Dense matching (``dense.py``) starts from rough depths. Between the SfM points of a capture of few images these are
-wrong by more than optical flow mends: a wall beside the path is twice as large in one image as in the one before. A
-plane through a patch predicts how a neighbour shows it, magnified and slanted. Random planes are compared at a small
-size, the good ones spread from pixel to pixel, and larger sizes refine them (``ops/patches``).
+Dense matching (``dense.py``) starts from rough depths. Between the SfM points of a capture of few images these errors
+are too large for optical flow: a wall beside the path is twice as large in one image as in the previous one. A plane
+through a patch predicts its appearance in a neighbour, magnified and slanted. Random planes are compared at a small
+size, good ones spread from pixel to pixel, and larger sizes refine them (``ops/patches``).
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ LEVELS = ((4, 6, 1.0), (2, 4, 0.5), (1, 3, 0.3))
 """Each level's divisor of the size, its rounds, and how much planes change in the first, which halves in each: octaves
 of the inverse depth, and parts of the unit normal."""
 RANDOM, BEYOND = 8, 4.0
-"""Random planes for each pixel of the smallest size, and how far they reach beyond the nearest and farthest points."""
+"""Random planes per pixel at the smallest size, and factor by which their range exceeds that of the points."""
 FASTEST, SLOWEST = 0.35, 1.0
-"""Where no point is known they reach from a motion by this part of the width, in the nearest neighbour, to one by so
-many pixels, in the farthest."""
+"""Their range without points: from a displacement by this part of the width in the nearest neighbour to one by so many
+pixels in the farthest."""
 STRIDE = 2
 """Pixels between the pixels of a patch."""
 MIN_ALIKE = 0.7
-"""Least correlation of a plane that is kept (``ops/patches.Patches``)."""
+"""Minimum correlation of a plane that is kept (``ops/patches.Patches``)."""
 NOISE, MAX_RELATIVE = 0.75, 0.15
 """Standard deviation of a depth as a motion in the second best neighbour, pixels; largest relative error."""
 SAME = 1.1
 """Inverse depths differ by at most this factor from the median around them, and those of one surface from pixel to
 pixel."""
 SPECK, MARGIN = 100, 3
-"""Pixels of a surface, at least, and across which nothing is kept about a step in depth."""
+"""Minimum number of pixels of a surface, and width of the gap about a step in depth."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def search_surfaces(
     view: View, others: Sequence[View], rough: Map, max_relative: float = MAX_RELATIVE
 ) -> Surfaces | None:
     """Planes through the pixels of a view at a low resolution; None if it is too small, or has no parallax to others.
-    ``rough`` are inverse depths to start from, of which the range matters most, 0 where unknown. [H, W]"""
+    ``rough`` are initial inverse depths, of which the range matters most, 0 where there are none. [H, W]"""
     height, width = view.gray.shape
     smallest = max(1.0, (height * width / PIXELS) ** 0.5)
     apart = np.array([np.linalg.norm(other.pose[:, 3] - view.pose[:, 3]) for other in others])
@@ -105,7 +105,7 @@ def search_surfaces(
             # And planes of any depth in the range of rough ones, facing the camera.
             if (rough > 0).any():
                 near, far = np.percentile(rough[rough > 0], [99, 1]) * [BEYOND, 1 / BEYOND]
-            else:  # on a walk all but the nearest neighbours have long turned away from what is near
+            else:  # on a walk, only the nearest neighbours still see near content
                 near = FASTEST * width / view.pinhole[0] / max(apart.min(), 0.1 * apart.max())
                 far = SLOWEST * smallest / view.pinhole[0] / apart.max()
             size, (fx, fy, cx, cy) = (RANDOM, *shape), pinhole
@@ -143,10 +143,10 @@ def _resized(planes: Tensor, shape: tuple[int, ...]) -> Tensor:
 
 
 def _certain(view: View, others: Sequence[View], patches: Patches, max_relative: float) -> Surfaces:
-    """The planes that are alike, close to those around them, and precise enough."""
+    """Planes with a high correlation, close to those around them, and precise enough."""
     planes = patches.planes.numpy()
     inverse: Map = np.ascontiguousarray(planes[..., 0])
-    # Pixels of motion for each unit of inverse depth in the second best view that shows it, or in the one that does.
+    # Displacement per unit of inverse depth in the second best view that sees it, or in the only one.
     change: Map = np.maximum(1e-3 * inverse, 1e-12)
     best, second = np.zeros((2, *inverse.shape), np.float32)
     for other in others:

@@ -1,7 +1,7 @@
-"""Exposure and white balance of the training images, from the colours of surfaces that several of them show.
+"""Exposure and white balance of the training images, from the colours of surfaces that several of them see.
 
-Cameras with automatic exposure brighten and darken the same wall. A gain for each image and channel is found from the
-known depths: a pixel whose surface another image shows at the same distance gives the ratio of the two colours. The
+Cameras with automatic exposure brighten and darken the same wall. A gain for each image and channel is estimated with
+the depth priors: a pixel whose surface another image sees at the same distance gives the ratio of the two colours. The
 ratio also depends on where in the image a surface lies: lenses darken their borders (vignetting), and on a straight
 drive every surface moves from the middle to the border, so that each image seems darker than the one before. Therefore
 
@@ -9,8 +9,8 @@ drive every surface moves from the middle to the border, so that each image seem
 
 is solved for the gains k and the fall-off (a, b) together, robustly, with exposure times from EXIF as further equations
 k_j - k_i = s log(E_j / E_i), s unknown as the camera's tone curve is. Gains are used only if they predict the ratios of
-image pairs that were left out. Colours are those of the files: for a tone curve near a power law a change of exposure
-multiplies them.
+held-out image pairs. Colours are those of the files: for a tone curve near a power law a change of exposure multiplies
+them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ NEIGHBOURS, MAX_ANGLE = 6, 40.0
 BYTES_OF_VIEW = 21
 """Of a pixel of an ``ExposedView``."""
 HIDDEN = 0.3
-"""Log ratio from the median beyond which another surface is taken to hide one, where distances are not known."""
+"""Log ratio from the median above which a surface counts as occluded, where there are no distances."""
 
 WINDOW = 5
 """Side of the window over which colours are averaged, pixels: single pixels differ by misregistration."""
@@ -54,11 +54,11 @@ DARK, BRIGHT = 15, 245
 CERTAIN, SAME_DISTANCE = 0.03, 0.03
 """Largest relative error of a depth, and relative difference of a surface's distances in two images."""
 SAMPLES, FEWEST = 4000, 30
-"""Pixels of an image that are looked up in another one, and the fewest matches that count."""
+"""Pixels of an image that are projected into another one, and minimum number of matches."""
 GROUPS, GROUP = 6, 40
-"""Most groups by radius whose medians summarise the matches of a pair, and least matches of a group."""
+"""Maximum number of groups by radius whose medians summarise the matches of a pair, and minimum size of a group."""
 LEAST_ERROR = 0.01
-"""Error of a median that the surroundings cause: reflections, blur. Log ratio."""
+"""Error of a median due to reflections and blur, log ratio."""
 TONE, TONE_ERROR, EXIF_ERROR = 0.5, 0.25, 0.1
 """Expected exponent of the tone curve, its standard deviation, and the error of a log ratio that EXIF predicts."""
 LOOSE = 1.0
@@ -112,7 +112,7 @@ class ExposedView:
     exposed: Bool[ndarray, "H W"]
     """Where no pixel of the window is dark, clipped or masked."""
     depth: Float[ndarray, "H W 2"] | None
-    """Inverse distances, 0 where unknown, and their errors; None if that of no pixel is known."""
+    """Inverse distances, 0 where there are none, and their errors; None without any."""
     number: int
     """Among the cameras."""
 
@@ -141,9 +141,9 @@ def pair_ratios(
     pixels: Int[ndarray, "P 2"],
     points: Float[ndarray, "P 3"],
 ) -> ColorRatios | None:
-    """Colours of surfaces, at pixels (row, column) of one image, in another; None if it shows too few of them.
+    """Colours of surfaces, at pixels (row, column) of one image, in another; None if it sees too few of them.
 
-    If ``second`` has no depths, what it shows instead of a surface is told by colour.
+    If ``second`` has no depths, occlusions are detected by colour.
     """
     rows, columns = pixels.T
     at = project(cameras, second.number, points)
@@ -172,7 +172,7 @@ def color_ratios(
     image_of: Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8]]],
     seed: int = 0,
 ) -> ColorRatios | None:
-    """Colours of the same surfaces in each training image and its nearest views; None if none show the same.
+    """Colours of the same surfaces in each training image and its nearest views; None if there are none.
 
     ``image_of`` gives the colours [H, W, C] of an image, and where it may be used [H, W]; ``seed`` draws pixels.
     """
@@ -256,12 +256,12 @@ def exposure_of_view(
     exposures: Float[ndarray, "N 3"],
     falloff: Float[ndarray, "2 3"],
 ) -> Float[ndarray, "3"] | None:
-    """Exposure of an image that was not calibrated, by what it and calibrated images show; None if they show nothing.
+    """Exposure of an image that was not calibrated, by surfaces that calibrated images see too; None without any.
 
     Args:
         view, others: the image, and calibrated ones nearby.
         cameras, exposures, falloff: of the calibrated images.
-        pixels, points: row and column of some of the image's pixels, and the surfaces that they show.
+        pixels, points: row and column of some of the image's pixels, and the points on their surfaces.
     """
     parts = [pair_ratios(view, other, cameras, pixels, points) for other in others]
     ratios = [part for part in parts if part is not None]
@@ -273,7 +273,7 @@ def exposure_of_view(
 
 
 def image_gains(ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] | None = None) -> Gains:
-    """Gains of ``count`` images with how well they predict pairs of images that were left out of their estimate."""
+    """Gains of ``count`` images, with their error on held-out pairs of images."""
     pairs = np.minimum(ratios.first, ratios.second) * count + np.maximum(ratios.first, ratios.second)
     fold = np.unique(pairs, return_inverse=True)[1] % FOLDS
     residuals: dict[bool, list[NDArray[np.float64]]] = {False: [], True: []}
@@ -297,7 +297,7 @@ def exposure_of_image(
     observed: Tensor,
     outputs: dict[str, Tensor],
 ) -> Tensor | None:
-    """Exposure of an evaluated image [3], by surfaces that training images near it show too; None if they show nothing.
+    """Exposure of an evaluated image [3], by surfaces that training images near it see too; None without any.
 
     Args:
         posed, dataset: the training images.

@@ -1,5 +1,5 @@
-"""COLMAP models: points, and which image saw which point at which pixel, read from files or made with given poses: from
-features and matches in one database, for training and ``mmpi-prepare``."""
+"""COLMAP models: points, and which image sees which point at which pixel. Read from files, or triangulated with given
+poses from features and matches in a database, for training and ``mmpi-prepare``."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 OLDEST_PYCOLMAP = 4
 """First major version with the functions that this package calls."""
 MIN_TRACK, MAX_ERROR_PX = 3, 2.0
-"""Points seen by fewer images, or with a larger mean reprojection error, are too uncertain to supervise depth."""
+"""Minimum number of images and maximum mean reprojection error of points that supervise depth."""
 MIN_ANGLE = 0.5
-"""Minimum angle in degrees between the rays of a point; driving forward gives little more."""
+"""Minimum triangulation angle of a point, degrees; a forward drive gives little more."""
 MIN_INLIERS = 15
 """Minimum number of matches of a pair: COLMAP's own limit."""
 SEED = 0
@@ -37,7 +37,7 @@ SEED = 0
 
 @dataclass(frozen=True)
 class SfmModel:
-    """Sparse points and their keypoints, image after image."""
+    """Sparse points and their keypoints, sorted by image."""
 
     points: NDArray[np.float64]
     """[P, 3] in the model's frame."""
@@ -53,7 +53,8 @@ class SfmModel:
     """Median distance of the matches from the epipolar lines of given poses, relative to the width of the image; NaN
     for a model read from files."""
     matches: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 10)))
-    """[N, 10] some of the verified matches: two images, their rays and their rays without a lens (``Matches``)."""
+    """[N, 10] some of the verified matches: two images, their rays, and their rays without lens distortion
+    (``Matches``)."""
 
 
 def find_sfm_model(path: Path) -> SfmModel | None:
@@ -102,7 +103,7 @@ def load_pycolmap() -> ModuleType:
 
 
 def read_reconstruction(model: pycolmap.Reconstruction, min_track: int = MIN_TRACK) -> SfmModel:
-    """The points of a reconstruction that at least ``min_track`` images see well, and their keypoints."""
+    """Well-observed points of a reconstruction, of at least ``min_track`` images, and their keypoints."""
     # In the order of the ids: that of the model itself may differ from one reading to the next.
     good = [i for i, p in sorted(model.points3D.items()) if p.track.length() >= min_track and p.error <= MAX_ERROR_PX]
     row = {point: n for n, point in enumerate(good)}
@@ -142,7 +143,7 @@ def numbers_in_model(files: Sequence[Path], names: Sequence[str]) -> NDArray[np.
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keeps COLMAP's log to what ends the program: errors are exceptions too, which are said in words."""
+    """Restricts COLMAP's log to fatal errors; other errors are exceptions too."""
     log = load_pycolmap().logging
     level, log.minloglevel = log.minloglevel, int(log.Level.FATAL)
     try:
@@ -152,7 +153,7 @@ def quiet() -> Iterator[None]:
 
 
 def rigid3d(camera_to_world: NDArray[np.float64]) -> Any:
-    """World to camera, as COLMAP has it, of a pose with OpenCV axes. [3, 4] or [4, 4]"""
+    """COLMAP's world-to-camera transform of a pose with OpenCV axes. [3, 4] or [4, 4]"""
     pycolmap, rotation = load_pycolmap(), camera_to_world[:3, :3]
     return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation.T), -rotation.T @ camera_to_world[:3, 3])
 

@@ -28,14 +28,14 @@ NEIGHBOURS = 8
 SMALL, LARGE = 800, 1600
 """Images up to the first size are doubled to find fine features; images above the second are reduced to it."""
 SAME_PLACE = 1e-6
-"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
+"""Fraction of their distance from the origin below which cameras count as one place in float32."""
 MAX_ANGLE = 60.0
 """Maximum angle in degrees between the viewing directions of matched images."""
 MIN_TRACK = 2
 """Minimum number of images of a point; with given poses, two are enough."""
 EFFORTS = ((0.0067, False, 15), (0.002, True, 8))
-"""Contrast of the faintest features (SIFT), whether a pair is matched again along the epipolar lines of its first
-matches, and its least inliers: for textured images, and for rooms at low resolution (two to four times slower)."""
+"""SIFT contrast threshold, guided matching, and minimum inliers of a pair: for textured images, and for rooms at low
+resolution (two to four times slower)."""
 FORMATS = {"PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "BMP": ".bmp", "TIFF": ".tif"}
 """Formats that pycolmap reads, as Pillow calls them, and their endings."""
 ENOUGH = 100
@@ -68,8 +68,8 @@ def _gathered(files: tuple[Path, ...], folder: Path) -> list[str]:
 
 
 def triangulate(images: PosedImages) -> SfmModel:
-    """Points seen in several images, in the frame of their poses, and their keypoints; images are named by their
-    indices.
+    """Points triangulated from several images, in the frame of their poses, and their keypoints; images are named by
+    their indices.
 
     Deterministic for equal images and poses. A quick search is followed by a thorough one if it finds too little. The
     quick search takes about a third of a second for each image on one core, the thorough one a second. Raises
@@ -109,7 +109,7 @@ def triangulate(images: PosedImages) -> SfmModel:
             tracks = read_reconstruction(model, MIN_TRACK)
         posed = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
         if not error <= FINE and len(names) > 1:
-            # Poses that are wrong name wrong neighbours: images that follow each other are evidence beside them.
+            # Wrong poses give wrong neighbours, so consecutive images are matched as well.
             sfm.match_pairs(database, [(a, b) for k in (1, 2) for a, b in zip(names, names[k:], strict=False)])
         matches = Matches.of(posed, database)
     assert tracks is not None and matches is not None

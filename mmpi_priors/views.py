@@ -23,7 +23,7 @@ Map = NDArray[np.float32]
 REMAP_SIDE, REMAP_PART = 32766, 8192
 """Largest side of an image for OpenCV's remap, and side of the parts into which larger ones are cut."""
 STRIP = 2**16
-"""Pixels that are worked on at once: their numbers stay in a core's cache."""
+"""Pixels processed at once: their values stay in a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class View:
     pose: NDArray[np.float64]
     """[3, 4] camera to world, OpenGL axes."""
     inside: NDArray[np.bool_]
-    """[h, w] where the lens shows something."""
+    """[h, w] mask of the pixels that the lens sees."""
     _reduced: dict[float, View] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """What ``reduced`` returned before: all neighbours of an image ask for the same sizes."""
+    """Results of ``reduced``, cached: all neighbours of an image ask for the same sizes."""
 
     def reduced(self, factor: float) -> View:
         """The view at one over ``factor`` of its size."""
@@ -57,7 +57,7 @@ class View:
 
 
 def load_view(images: PosedImages, i: int, side: int) -> View:
-    """Image i in gray, its longer side at most ``side`` pixels, its lens distortion taken out."""
+    """Image i in gray, undistorted, its longer side at most ``side`` pixels."""
     gray = _read(images.files[i], cv2.IMREAD_GRAYSCALE)
     full_height, full_width = gray.shape
     if max(gray.shape) > side:
@@ -95,7 +95,7 @@ def _bent_places(
 
 
 def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.uint8]:
-    """Blue, green and red of image i as its view shows it. [h, w, 3]"""
+    """Blue, green and red of image i, undistorted as its view. [h, w, 3]"""
     size = view.gray.shape[1], view.gray.shape[0]
     color = cv2.resize(_read(images.files[i], cv2.IMREAD_COLOR), size, interpolation=cv2.INTER_AREA)
     if images.is_bent(i):
@@ -105,7 +105,8 @@ def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.ui
 
 
 def straightened(images: PosedImages, i: int, shape: tuple[int, int], some: slice | None = None) -> NDArray[np.float64]:
-    """Tangents (right, down) at which pixels of an image of this shape look, lens taken out; of some rows. [2, H, W]"""
+    """Tangents (right, down) of the rays of an image's pixels at this shape, without lens distortion; of some rows. [2,
+    H, W]"""
     lens = tuple(images.distortion[i]) if images.is_bent(i) else ()
     camera = tuple(images.sizes[i]), tuple(images.intrinsics[i]), lens, images.is_fisheye(i)
     rows = [some] if some else strips(shape)
@@ -143,7 +144,7 @@ def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Parallax:
-    """Places of a view's pixels in a neighbouring view: homogeneous pixels a + q b for inverse depth q."""
+    """Positions of a view's pixels in a neighbouring view: homogeneous pixels a + q b for inverse depth q."""
 
     linear: NDArray[np.float64]
     """a at a pixel (x, y) is this times (x, y, 1). [3, 3]"""
@@ -168,8 +169,8 @@ class Parallax:
 
 
 def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside for points behind it or so far to
-    the side that the lens's polynomial turns back."""
+    """Pixels [P, 2] of points [P, 3] in a camera, lens included; far outside for points behind it or so far to the side
+    that the lens's polynomial turns back."""
     pose, fisheye, lens = posed.camera_to_worlds[j], posed.is_fisheye(j), posed.distortion[j]
     x, y, depth = ((points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]).T  # OpenCV's axes: right, down, ahead
     ahead, aside = depth > 0, np.hypot(x, y)
@@ -206,7 +207,7 @@ def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
 
 
 def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: bool = False) -> NDArray[Any]:
-    """Values of an image at pixel places, centres at halves: interpolated, or the nearest pixel's and 0 outside.
+    """Values of an image at pixel positions, centres at halves: interpolated, or the nearest pixel's and 0 outside.
 
     The image [H, W] or [H, W, C] may have any size, and the places any one shape, which the values have, too.
     """

@@ -1,6 +1,6 @@
-"""How alike an image and others are at inverse depths that are the same all over it, by correlation of windows.
+"""Plane sweep: correlation of an image's windows with other images at inverse depths common to all pixels.
 
-Places in the others are rounded to a 32nd of a pixel and gray levels to integers, as OpenCV does, so that sums over
+Positions in the others are rounded to a 32nd of a pixel and gray levels to integers, as OpenCV does, so that sums over
 windows are exact in any order and can slide from pixel to pixel.
 """
 
@@ -16,18 +16,18 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_priors.ops.patches import Others
 
 REACH, PIXELS, STEPS = 3, 49, 32
-"""Pixels of a window on each side of its middle, all of them, and places in a pixel that are told apart. A window whose
-gray levels have a smaller standard deviation than 1 counts as one of 1."""
+"""Pixels of a window on each side of its centre, all of them, and subpixel positions. Windows whose gray levels have a
+standard deviation below 1 count as 1."""
 
 
 class Likeness(NamedTuple):
-    """Of the inverse depths of three kinds, at each pixel: those that are possible, the others, and those at which
-    another image shows a marked pixel."""
+    """Best inverse depths of three kinds at each pixel: possible ones, impossible ones, and those at which another
+    image has a marked pixel."""
 
     alike: Float[Tensor, "3 H W"]
     """The largest correlation, -1 where there is none."""
     inverse: Float[Tensor, "3 H W"]
-    """The first inverse depth that has it, 0 where there is none."""
+    """The first inverse depth with it, 0 where there is none."""
 
 
 @operation(in_cpp=0)
@@ -39,7 +39,7 @@ def most_alike(
     most: float,
     pairs: bool,
 ) -> Likeness:
-    """Inverse depths at which an image and others are most alike.
+    """Inverse depths with the largest correlation between an image and others.
 
     Args:
         gray: the image.
@@ -47,7 +47,7 @@ def most_alike(
         inverse: inverse depths, behind the camera below 0.
         least: the smallest possible one of each pixel.
         most: the largest possible one of all.
-        pairs: the mean of the best two others counts, whatever is marked, instead of each alone.
+        pairs: use the mean of the best two others, whatever is marked, instead of each alone.
     """
     shape, none = (3, *gray.shape), torch.full(gray.shape, -1.0)
     alike, at, image = torch.full(shape, -1.0), torch.zeros(shape), gray.int()

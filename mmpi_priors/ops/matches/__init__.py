@@ -1,7 +1,7 @@
 """Parallax between two images: where points appear in the other one, depths of matches there, and their mean.
 
 A point at inverse depth q on pixel (x, y) of an image appears in another one at the homogeneous pixel a + q b, where a
-is linear in (x, y, 1) (``capture/dense.py``). A match there gives two linear equations r + q s = 0.
+is linear in (x, y, 1) (``mmpi_priors/dense.py``). A match there gives two linear equations r + q s = 0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ AGREE = 2.5
 
 
 class Places(NamedTuple):
-    """Where the points of an image's pixels appear in another image."""
+    """Positions of an image's pixels in another image."""
 
     x: Float[Tensor, "H W"]
     """Pixels, ``FAR`` for points behind."""
@@ -34,23 +34,23 @@ class Places(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Values of two maps where pixels have moved to."""
+    """Values of two maps at the ends of motions."""
 
     x: Float[Tensor, "H W"]
     y: Float[Tensor, "H W"]
 
 
 class Compared(NamedTuple):
-    """What another image's depths say of an image's."""
+    """Comparison of an image's depths with another's."""
 
     confirms: Bool[Tensor, "H W"]
-    """It has the same depth there,"""
+    """The other has the same depth there,"""
     contradicts: Bool[Tensor, "H W"]
-    """or a farther one: it sees through."""
+    """or a farther one: it sees through the point."""
 
 
 class Measured(NamedTuple):
-    """Inverse depths with a number that tells how certain they are; both 0 where there is none."""
+    """Inverse depths with their certainty or error; both 0 where there is none."""
 
     inverse: Float[Tensor, "H W"]
     certainty: Float[Tensor, "H W"]
@@ -59,7 +59,7 @@ class Measured(NamedTuple):
 
 @operation(in_cpp=0)
 def place_pixels(inverse: Float[Tensor, "H W"], linear: Float[Tensor, "3 3"], b: Float[Tensor, "3"]) -> Places:
-    """Places of pixels in another image.
+    """Positions of pixels in another image.
 
     Args:
         inverse: inverse depths of an image.
@@ -75,7 +75,7 @@ def place_pixels(inverse: Float[Tensor, "H W"], linear: Float[Tensor, "3 3"], b:
 
 @operation(in_cpp=0)
 def follow_motion(x: Float[Tensor, "H W"], y: Float[Tensor, "H W"], motion: Float[Tensor, "H W 2"]) -> Moved:
-    """Values of two maps at the places that pixels have moved to, interpolated; beyond the borders those of the border.
+    """Values of two maps at the ends of motions, interpolated; beyond the borders those of the border.
 
     Args:
         x, y: the maps.
@@ -99,7 +99,7 @@ def solve_matches(
     """Inverse depths of matches, by least squares: q = -r.s / s.s.
 
     Args:
-        x, y: pixels of another image that match those of an image.
+        x, y: pixels of another image that match those of the image.
         alike: correlation of the windows about both.
         usable: which matches count.
         linear, b: as of ``place_pixels``.

@@ -1,9 +1,9 @@
 """Motion of overlapping patches between two images that look nearly alike (dense inverse search: Kroeger, Timofte, Dai
 and Van Gool, Fast Optical Flow using Dense Inverse Search, ECCV 2016).
 
-A patch of one image is compared with the other one at its motion, both less their means. By least squares the gradients
-of the first say how much farther the patch has moved, so that they are computed once. From coarse to fine images each
-begins with the motion of the one before; patches take over the motions of patches around them that suit them better.
+A patch of one image is compared with the other one at its motion, both less their means. The gradients of the first
+give the step of the patch by least squares, so they are computed once. From coarse to fine, each size begins with the
+motion of the previous one; patches take the motions of neighbouring patches that fit better.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ SIDE = 8
 FLAT = 16.0
 """Added to the sums of squared gradients of a patch: one of a single colour stays where it is."""
 APART, FARTHEST = 0.25, 8.0
-"""Pixels from which on two motions differ, and by which a patch may move on from where it began."""
+"""Distance above which two motions differ, and maximum displacement of a patch from its start, pixels."""
 
 
 @operation(in_cpp=0)
 def refine_motion(
     gray: UInt8[Tensor, "H W"], other: UInt8[Tensor, "H W"], coarse: Float[Tensor, "A B 2"], stride: int, rounds: int
 ) -> Float[Tensor, "H W 2"]:
-    """Right and down, pixels by which what an image shows moves to another one.
+    """Optical flow from an image to another one, right and down, pixels.
 
     Args:
         gray: the image, of at least ``SIDE`` pixels in height and width.
@@ -94,14 +94,14 @@ class _Patches:
         return between(self.other[..., None], *torch.broadcast_tensors(x, y))[..., 0] - self.gray
 
     def compare(self, motion: Tensor) -> tuple[Tensor, Tensor]:
-        """Sums of squared differences less their means, and steps that make them least."""
+        """Sums of squared differences less their means, and the least-squares steps."""
         apart = self.differences(motion)
         towards = torch.einsum("pqij,pqijn->pqn", apart, self.gradients)
         steps = -(self.inverse @ towards[..., None])[..., 0]
         return apart.square().sum((2, 3)) - apart.sum((2, 3)).square() / SIDE**2, steps
 
     def descended(self, start: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
-        """The best of some steps from motions, and their errors."""
+        """The best motions of some steps, and their errors."""
         at, best, least = start, start, torch.full(self.shape, torch.inf, dtype=start.dtype)
         goes_on = torch.ones(self.shape, dtype=torch.bool)
         for _ in range(rounds):

@@ -1,9 +1,9 @@
-"""Planes through the pixels of an image that make other images look like it (PatchMatch stereo: Bleyer, Rhemann and
-Rother 2011; many pixels at once as in Galliani, Lasinger and Schindler 2015).
+"""Planes through the pixels of an image by PatchMatch stereo (Bleyer, Rhemann and Rother 2011; many pixels at once as
+in Galliani, Lasinger and Schindler 2015).
 
 In a pinhole image the inverse depth of a plane is linear in the pixel, so a pixel's plane is (q, right, down): its
-inverse depth there and the change for each pixel. A patch on it appears in another image at the homogeneous pixels
-a + q b (``ops/matches``), which are linear in the pixel, too. Planes are judged by the correlation of patches.
+inverse depth there and the change for each pixel. A patch on it appears in another image at the homogeneous pixels a +
+q b (``ops/matches``), which are linear in the pixel, too. Planes are scored by the correlation of patches.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LEAST_AHEAD, LEAST_SHARE = 1e-6, 0.2
 LEAST_CONTRAST = 1.0
 """Standard deviation of gray levels of a patch, at least."""
 ALONE = 0.1
-"""How much less than the best correlation one with an image that does not show the patch counts as."""
+"""Amount below the best correlation that an image which does not see the patch counts as."""
 OFFSETS = (1, 4, 2)
 """Pixels from which planes spread, in turn."""
 GRAZING = 0.05
@@ -51,7 +51,7 @@ class Patches(NamedTuple):
     """Inverse depth at the pixel's centre, and its change for a pixel to the right and for one down."""
     alike: Float[Tensor, "H W"]
     """Mean of the two largest correlations (with one image: that), the largest less ``ALONE`` for images that do not
-    show the patch; -1 where none does."""
+    see the patch; -1 where none does."""
 
 
 @operation(in_cpp=1)
@@ -62,12 +62,12 @@ def compare_planes(
     others: Others,
     stride: int,
 ) -> Patches:
-    """The better ones of two planes at each pixel.
+    """The better of two planes at each pixel.
 
     Args:
         gray: the image.
         patches: planes, with their correlations.
-        planes: what they are compared with.
+        planes: the other ones.
         others: the images that decide.
         stride: pixels between the pixels of a patch, of which there are 5 x 5.
     """
@@ -84,7 +84,7 @@ def spread_planes(
     stride: int,
     offset: int,
 ) -> Patches:
-    """The best of each pixel's plane, those of the pixels around it, and two that differ from the best a little.
+    """The best of each pixel's plane, those of the pixels around it, and two small perturbations of the best.
 
     Args:
         gray: the image.
@@ -152,7 +152,7 @@ def _better(references: _References, patches: Patches, planes: Tensor, others: O
 def _correlations(
     references: _References, planes: Tensor, corners: Tensor, sizes: Tensor, linear: Tensor, b: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Correlations of patches with one image (-1: none), and whether it shows their middles. [H, W] each"""
+    """Correlations of patches with one image (-1: none), and whether it sees their centres. [H, W] each"""
     q, right, down = planes.unbind(-1)
     middle = torch.stack([a + q * s for a, s in zip(linear_at(q, linear), b, strict=True)])
     to_right, to_down = (
