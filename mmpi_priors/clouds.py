@@ -148,7 +148,7 @@ class Sightings:
                 "transforms.json."
             )
         used = np.unique(self.seen_point[~out[self.seen_point]])
-        left_out = f"; {out.sum():,} are left out, as images look through them" if out.any() else ""
+        left_out = f"; {out.sum():,} are dropped, because images see through them" if out.any() else ""
         return (
             f"Point cloud: {len(used):,} of {len(self.points):,} points are seen, {(self.confirmed > 0).sum():,} of "
             f"them where matches have a depth{left_out}. They are used for placement and depths."

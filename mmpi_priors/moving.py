@@ -103,9 +103,9 @@ def find_moving(
     known = float(np.median([share_known(shot) for shot in shots]))
     if known < KNOWN:
         says = (
-            f"What moves is not known and nothing is masked: other images confirm the depths of {known:.0%} of the "
-            "textured pixels alone, too few to tell what moves from what is hidden. People who walk along may be left "
-            "in: take images closer together, or mask them by hand (mask_path)."
+            f"Nothing is masked, as other images confirm the depths of {known:.0%} of the textured pixels alone: too "
+            "few to tell motion from occlusion. People who walk along may be left in: take images closer together, or "
+            "mask them by hand (mask_path)."
         )
         return [shot.view for shot in shots], nothing, says
 
@@ -204,10 +204,10 @@ def moving_masks(
     def find() -> Arrays:
         deque(in_order(_decode, images.files), maxlen=0)  # names a damaged file, for which OpenCV would print warnings
         forecast = duration(SECONDS * len(shapes) / num_threads())
-        CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {forecast}.")
+        CONSOLE.print(f"Searching {len(shapes)} images for moving objects: about {forecast}.")
         views, masks, doubt = find_moving(
             images, lambda i: points[seen_by == i],
-            progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),
+            progress=lambda work, count: track(work, "Moving objects", count, console=CONSOLE),
         )  # fmt: skip
         return {
             f"{i}": np.packbits(in_image(v, m, images, i, s) if m.any() else np.zeros(s, bool))

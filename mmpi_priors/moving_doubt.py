@@ -46,16 +46,16 @@ def doubt_of(shots: Sequence[Shot], up: NDArray[np.float64], masks: Sequence[Mas
     ahead = np.abs((facing[1:] * steps).sum(-1)) / np.maximum(lengths, 1e-12)
     if np.median(ahead) <= AHEAD or np.median(turns) < STEADY:
         return ""
-    ends = " Cars that keep their distance may not be masked and become streaks: mask them by hand (mask_path)."
+    ends = " Cars at a constant distance may not be masked and leave streaks: mask them by hand (mask_path)."
     sunk, height = share_sunk(shots, up, masks)
     if sunk >= SUNK and lengths.sum() >= LONG * height:
         return (
-            f"This looks like a drive along a road. What moves is doubtful: {sunk:.0%} of what lies below the horizon "
-            "seems to be far below the road, as cars do that go as fast as the camera, and its own bonnet." + ends
+            f"This looks like a drive along a road. The masks are doubtful: {sunk:.0%} of what lies below the horizon "
+            "appears far below the road, as do cars that drive as fast as the camera, and its own bonnet." + ends
         )
     if is_straight(views) and grounds < GROUNDS * len(shots):
         return (
-            "This looks like a drive straight ahead. What moves is doubtful: the road is found in "
+            "This looks like a drive straight ahead. The masks are doubtful: the road is detected in "
             f"{grounds} of {len(shots)} images." + ends
         )
     return ""

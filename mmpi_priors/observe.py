@@ -73,14 +73,14 @@ def observe(
     model = find_sfm_model(folder / getattr(parser, "colmap_path", sfm_path))
     observations = read_observations(outputs, dataset.cameras, model, point_cloud(outputs, parser))
     if np.ptp(observations.centers, axis=0).max() <= SAME_PLACE * max(1.0, np.abs(observations.centers).max()):
-        CONSOLE.print("[bold yellow]All training cameras stand in one place: no distance can be learned.")
+        CONSOLE.print("[bold yellow]All training cameras have the same position: depths cannot be learned.")
     if find_points:
         if not len(observations.seen_by):
             check = partial(check_cameras, file_matrices(observations, outputs, folder), trusts=trusts)
             observations = _find_points(observations, dataset, triangulates, check)
         else:
             if observations.loose is not None:
-                say_once("Point cloud: not used, as the SfM tracks tell of each point which images saw it.")
+                say_once("Point cloud: not used, because the SfM tracks record which images see each point.")
                 observations = replace(observations, loose=None)
             angles = keypoint_angles(observations, dataset.cameras)
             off = np.median(angles * observations.intrinsics[observations.seen_by, 0])
@@ -208,7 +208,7 @@ def tell_poses(off: float, image: Path) -> None:
     refined, poses = full.parent.with_name(f"{full.parent.name}-refined"), full.parent / "transforms.json"
     command = f"mmpi-prepare {quoted(full)} {quoted(refined)} --poses {quoted(poses)} --refine-poses"
     says = f"The poses are off by {off:.1f} training pixels (median over the matches of the images)"
-    CONSOLE.print(f"{says}: {command} mends them.", style="bold yellow", markup=False, soft_wrap=True)
+    CONSOLE.print(f"{says}: {command} refines them.", style="bold yellow", markup=False, soft_wrap=True)
 
 
 def read_observations(
