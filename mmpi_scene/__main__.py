@@ -37,7 +37,7 @@ class SceneCommand:
     length: float | None = None
     """Metres driven or walked (street: 40, long-road: 1000, walk: 60)."""
     seed: int = 0
-    """Each seed gives another scene of the same kind."""
+    """Seed of the scene's random content."""
     points: int | None = None
     """SfM points; by default 4,000, and four a metre on drives of more than a kilometre."""
     noise: float = 0.3
@@ -48,7 +48,8 @@ class SceneCommand:
     """auto: gains that follow the content (three-fold), white balance, vignetting and a tone curve, written to
     exposure.json. vignetting: one exposure, half of the light lost in the corners."""
     moving: int = 0
-    """Cars and people that move through a street; exact masks in moving/. Test images show none of them."""
+    """Number of cars and people that move through a street; exact masks in moving/. Test images are rendered without
+    them."""
     images: tyro.conf.FlagConversionOff[bool] = True
     """False: write cameras, points and tracks only."""
     overwrite: bool = False

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 NEWTON_STEPS, CONVERGED = 20, 1e-14
-"""Newton steps by which distortion is inverted at most, and the step (a tangent) at which it is."""
+"""Maximum number of Newton steps for the inverse of the distortion, and the step (a tangent) at which they end."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Cameras:
 
     @property
     def is_test(self) -> NDArray[np.bool_]:
-        """[M] held out for testing."""
+        """[M] mask of the held-out images."""
         return np.arange(len(self)) % self.test_every == self.test_every // 2
 
     @cached_property
@@ -53,7 +53,7 @@ class Cameras:
         return self.tangents(self.pixel_centers)
 
     def tangents(self, pixels: Array) -> Array:
-        """Tangents [N, 2] (to the right, downwards) at which the lens sees pixels [N, 2]."""
+        """Tangents [N, 2] (right, down) of the rays of pixels [N, 2]."""
         distorted = (pixels - self.center) / self.focal
         if not any(self.distortion):
             return distorted

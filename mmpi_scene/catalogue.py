@@ -11,7 +11,7 @@ from mmpi_scene.scene import Scene
 
 @dataclass(frozen=True)
 class Entry:
-    """A kind of scene and what it is made with unless told otherwise."""
+    """A kind of scene and its default options."""
 
     make: Any
     """(seed, count, width, height[, length]) -> Scene."""
@@ -42,7 +42,7 @@ def make_scene(
     height: int | None = None,
     length: float | None = None,
 ) -> Scene:
-    """A scene of the catalogue, with ``count`` images of these pixels, of a drive of this length in metres; equal
+    """A scene of the catalogue, with ``count`` images of this size and a drive of this length in metres; equal
     arguments give equal scenes. Raises ValueError if there is no such scene, or it cannot be made like this."""
     if name not in SCENES:
         raise ValueError(f"There is no scene {name!r}: choose one of {', '.join(SCENES)}.")

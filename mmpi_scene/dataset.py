@@ -4,7 +4,7 @@ Images may be exposed: gains that follow the content, white balance, vignetting 
 
     pixel value = tone(min(1, gain * (1 - vignetting * r^2) * light)),    r = 1 in the corners
 
-Light is what the tone curve makes the scene's colours of, so that a gain of 1 without vignetting changes nothing.
+Light is the inverse of the tone curve at the scene's colours, so that a gain of 1 without vignetting changes nothing.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ METERED = 24, 16
 LOST = {"auto": 0.3, "vignetting": 0.5}
 """Share of the light that is lost in the corners."""
 SECONDS, SPEED, APERTURE = 0.01, 100, 1.8
-"""What EXIF says of an image whose gain is 1."""
+"""EXIF values of an image whose gain is 1."""
 KNOTS = np.linspace(0.0, 1.0, 1 << 14)
 PARTS = (
     *("transforms.json", "images", "images_2", "images_4", "images_8", "depths", "moving", "exposure.json", "colmap"),
     "sparse_pc.ply",
 )
-"""What belongs to a data set, and is removed before another one is written in its place."""
+"""Files and folders of a data set, which are removed before another one replaces it."""
 MILLIMETRES = 65535
 """The farthest depth that a 16-bit file holds; 0 stands for farther, and for the sky."""
 
@@ -78,7 +78,7 @@ class Exposure:
         return tone(np.minimum(1, self.gains[camera] * passed * light_of(colors))).astype(np.float32)
 
     def to_object(self, names: list[str]) -> dict[str, Any]:
-        """What is written beside the images."""
+        """The content of exposure.json."""
         return {
             "model": "value = tone(min(1, gain * (1 - vignetting * r^2) * light)), r = 1 in the corners; "
             "tone(x) = y + contrast * y * (1 - y) * (2 * y - 1), y = x^(1 / gamma)",
@@ -136,8 +136,9 @@ def write_dataset(
 ) -> SfmPoints:
     """Writes images, depths (along the optical axis), transforms.json, sparse_pc.ply and colmap/sparse/0.
 
-    With movers also their exact masks (moving/), which transforms.json does not name: finding them is what is tried.
-    With an exposure also exposure.json. All is in the scene's own frame, which applied_transform states.
+    With moving objects also their exact masks (moving/), which transforms.json does not name: tests compare detected
+    masks with them. With an exposure also exposure.json. All is in the scene's own frame, which applied_transform
+    states.
 
     ``points``, ``noise_pixels`` and ``outliers`` are those of ``sfm_points``. Without ``images`` only cameras and
     points are written, without ``tracks`` no points and no COLMAP model, which need pycolmap. ``progress`` wraps the
@@ -189,7 +190,7 @@ def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> 
 
 
 _writing: tuple[Scene, Path, Exposure | None]
-"""What the processes of a pool write: forks inherit it, as a scene's functions cannot be sent."""
+"""Arguments of the processes of a pool: forks inherit them, as a scene's functions cannot be sent."""
 
 
 def _write_images(
@@ -218,7 +219,7 @@ def _write_images(
 
 
 def check_folder(folder: Path, overwrite: bool) -> None:
-    """Raises FileExistsError where a data set must not be written."""
+    """Check that a data set may be written. Raises FileExistsError if not."""
     if folder.is_dir() and any(folder.iterdir()):
         if not overwrite:
             raise FileExistsError(f"{folder} is not empty: choose another folder, or add --overwrite to replace it.")

@@ -1,4 +1,4 @@
-"""Textures, and what solids look like: each material maps surface coordinates to a colour.
+"""Textures of solids: each material maps surface coordinates to a colour.
 
 All are band-limited by the footprint of a pixel, so that they do not alias far away. Stripes, bricks and windows are
 pulse trains under a box filter, which has a closed form; noise is value noise of several octaves in a tile with its

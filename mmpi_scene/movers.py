@@ -1,6 +1,6 @@
-"""Cars and people that move through a street while it is filmed, and exact masks of what they change.
+"""Cars and people that move through a street while it is filmed, and exact masks of the pixels that they change.
 
-Test images hold none of them: their truth is the street without movers.
+Test images are rendered without them.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ LANE, PAVEMENT = 1.8, 7.6
 STRIDES, SWING = 0.95, 0.28
 """Double steps a second, and metres by which a foot is ahead of the body."""
 MOVER, SHADOW = 255, 128
-"""Values of masks: a mover is seen, or the light that it takes away."""
+"""Values of masks: the object itself, or its shadow."""
 CHANGED = 1 / 255
-"""Change of a colour from which on a shadow counts."""
+"""Minimum change of a colour in a shadow."""
 
 
 def movers_at(seed: int, road: Road, count: int, along: Array, walks: bool, camera: int) -> Primitives:
@@ -79,7 +79,8 @@ def with_movers(scene: Scene, count: int) -> Scene:
 
 
 def moving_mask(scene: Scene, camera: int) -> NDArray[np.uint8]:
-    """Where an image [H, W] shows a mover, if only by one of 3 x 3 rays of a pixel, or its shadow; zeros elsewhere."""
+    """Mask [H, W] of the pixels of which at least one of 3 x 3 rays meets a moving object, or its shadow; zeros
+    elsewhere."""
     cameras, filmed = scene.cameras, scene.filmed_by(camera)
     mask = np.zeros(cameras.height * cameras.width, np.uint8)
     if filmed.movers is None or scene.movers is None:

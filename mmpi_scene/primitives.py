@@ -1,4 +1,4 @@
-"""Boxes, spheres and upright cylinders, a kit that collects them, and where rays meet them first.
+"""Boxes, spheres and upright cylinders, a kit that collects them, and their first intersections with rays.
 
 Float64, so that depth is exact. Rays come in packets that lie close together (tiles of an image): a packet is tested
 only against the primitives whose bounding spheres touch the cone around it.
@@ -83,7 +83,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 class Tracer:
-    """Finds first hits; ``reach`` is how far a ray goes before solids no longer count."""
+    """Tracer of first hits; solids farther than ``reach`` along a ray are ignored."""
 
     def __init__(self, primitives: Primitives, reach: float) -> None:
         self.primitives, self.reach, half = primitives, reach, primitives.half
@@ -95,7 +95,7 @@ class Tracer:
         """Height above which there is nothing."""
 
     def near(self, lowest: float, highest: float, distance: float | None = None) -> NDArray[np.int64]:
-        """Primitives that a ray starting between two x can meet: a search in the sorted centres, not a scan."""
+        """Primitives that a ray starting between two x can meet, by a search in the sorted centres."""
         margin = (self.reach if distance is None else distance) + self.widest
         x = self.primitives.center[:, 0]
         first, last = np.searchsorted(x, [lowest - margin, highest + margin])
@@ -119,7 +119,7 @@ class Tracer:
     def _packet(
         self, rows: NDArray[np.int64], origins: Array, directions: Array, reach: float
     ) -> tuple[Array, NDArray[np.int64]]:
-        """First hits of a packet among ``rows``; a packet that would be tested against too much is halved."""
+        """First hits of a packet among ``rows``; a packet with too many candidates is halved."""
         rows, size = self.in_cone(rows, origins, directions, reach), len(directions)
         if size > 256 and size * len(rows) > 100_000:
             halves = (slice(None, size // 2), slice(size // 2, None))

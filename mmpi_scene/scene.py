@@ -25,7 +25,7 @@ TILE = 64
 
 @dataclass(frozen=True)
 class Light:
-    """A sun or a lamp, and what comes from all round."""
+    """A sun or a lamp, and ambient light."""
 
     toward: tuple[float, float, float]
     """Direction of the sun, or place of the lamp."""
@@ -51,18 +51,18 @@ class Scene:
     track_range: float = 60.0
     """SfM points are matched no farther away than this."""
     road: Road | None = None
-    """Along which a street lies."""
+    """The road of a street; None for other scenes."""
     movers: Callable[[int], Primitives] | None = None
-    """What moves, when an image is taken."""
+    """Moving objects at the time of an image."""
     moving: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
-    """[P] which solids are movers; empty: none."""
+    """[P] mask of the solids that are moving objects; empty: none."""
     noise: Noise = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noise", Noise(self.seed))
 
     def filmed_by(self, camera: int) -> Scene:
-        """The scene when an image is taken: with its movers, unless the image is held out for testing."""
+        """The scene at the time of an image: with its moving objects, unless the image is held out."""
         if self.movers is None or self.cameras.is_test[camera]:
             return self if self.movers is None else replace(self, movers=None)
         primitives, part = Primitives.merged(self.primitives, self.movers(camera))
@@ -73,7 +73,7 @@ class Scene:
         return Tracer(self.primitives, self.reach)
 
     def hit(self, origins: Array, directions: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Distance [R] (inf: the sky) and what is there [R]: a row of the primitives, or -1 for ground and sky."""
+        """Distance [R] (inf: the sky) and row of the primitive that is hit [R], -1 for ground and sky."""
         distance, row = self.tracer(origins, directions)
         down = directions[:, 2]
         ground = np.where(down < -1e-12, -origins[:, 2] / np.where(down < -1e-12, down, -1.0), np.inf)
@@ -81,8 +81,8 @@ class Scene:
         return np.where(below, ground, distance), np.where(below, -1, row)
 
     def trace(self, origins: Array, directions: Array, pixel: float = 0.0) -> tuple[Array, Colors]:
-        """Distance [R] of what each ray [R, 3] meets first, inf for the sky, and its colour [R, 3] in [0, 1], averaged
-        over the angle ``pixel`` that a ray stands for, radians."""
+        """Distance [R] of the first hit of each ray [R, 3], inf for the sky, and its colour [R, 3] in [0, 1], averaged
+        over the angle ``pixel`` of a ray, radians."""
         distance, colors = np.empty(len(directions)), np.empty((len(directions), 3), np.float32)
         for start in range(0, len(directions), PACKET):
             s = slice(start, start + PACKET)

@@ -1,7 +1,7 @@
 """Points and tracks as structure from motion would find them, with as much noise and as many outliers as asked.
 
-A track holds the cameras that really see its point (by the exact distance along the ray), its keypoints carry the
-noise, and its point is triangulated from them: uncertain along the road, as in a real capture.
+A track contains the cameras that see its point (by the exact distance along the ray). Its keypoints are noisy, and its
+point is triangulated from them: uncertain along the road, as in a real capture.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from mmpi_scene.primitives import Array, dot
 from mmpi_scene.scene import Scene
 
 MIN_TRACK = 3
-"""Cameras that must see a point."""
+"""Minimum number of cameras that see a point."""
 MIN_ANGLE = 0.5
-"""Degrees between two of a point's rays, without which it cannot be triangulated."""
+"""Minimum triangulation angle, degrees."""
 ROUNDS = 6
-"""Times that more points are drawn where too few were seen well enough."""
+"""Maximum number of times that more points are drawn if too few are visible."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class SfmPoints:
 
 
 def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: float = 0.02) -> SfmPoints:
-    """Points on what the cameras see, and who saw them where; fewer than ``count`` where the cameras see too few from
-    enough sides. Raises ValueError if a number is out of range.
+    """Points on visible surfaces, with their keypoints; fewer than ``count`` if too few are seen from enough
+    directions. Raises ValueError if a number is out of range.
 
     Args:
         noise_pixels: standard deviation of the keypoints' noise along x and along y.

@@ -34,7 +34,7 @@ STRIDE = (0.03, 0.025)
 
 
 class Street(Kit):
-    """What stands along a road: houses, parked cars, trees, lamps."""
+    """Objects along a road: houses, parked cars, trees, lamps."""
 
     def __init__(self, seed: int, road: Road, topic: int = 1) -> None:
         super().__init__(seed, topic)

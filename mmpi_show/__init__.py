@@ -1,4 +1,4 @@
-"""What is shown of trained scenes apart from nerfstudio: baked scenes, their web page, splats.
+"""Exports of trained scenes for use without nerfstudio: baked scenes, web page, splats.
 
 ``scene = mmpi_show.load(folder)`` reads a baked scene, and ``mmpi_ns.render`` renders images of it.
 """
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """The function above, imported when it is first asked for: torch and nerfstudio take seconds."""
+    """``load``, imported when it is first accessed: torch and nerfstudio take seconds."""
     if name != "load":
         raise AttributeError(f"module 'mmpi_show' has no attribute '{name}'")
     from mmpi_show.functional import load

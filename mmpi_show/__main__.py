@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mmpi_show.files import BakedScene
 
 UNFINISHED = r"window-\d{5}\.bin|\.(window-\d{5}\.bin|scene\.json)\.\d+\.tmp|index\.html"
-"""Names of files of an export without a header: it was stopped or the disk was full, and the next may replace it."""
+"""Files of an unfinished export, without a header, which the next one may replace."""
 
 
 @dataclass
@@ -28,14 +28,14 @@ class _Run:
     load_config: Path
     """config.yml of a finished run."""
     least: float = 0.003
-    """Bricks in which no training view sees this rendering weight are left out; 0 keeps all."""
+    """Bricks without a sample of this weight in any training view are dropped; 0 keeps all."""
     compare: int = 5
     """Test images to compare with the exact renderer; 0 for none."""
     overwrite: bool = False
     """Replace an existing export."""
 
     def check_paths(self, output: Path, is_file: bool = False) -> None:
-        """Checks the options and makes the folder to write.
+        """Check of the options; makes the output folder.
 
         Raises:
             ValueError: an option is out of range, there is no run, it has no checkpoint, there is something that an
@@ -131,7 +131,7 @@ class Splats(_Run):
     output: Path = Path("scene.ply")
     """File to write; scene-00000.ply and so on if there are several windows."""
     weight: float = 0.01
-    """Texels without this rendering weight in any training view are left out."""
+    """Texels without this weight in any training view are dropped."""
     most: int = 1_000_000
     """Maximum number of splats of a window."""
 
@@ -141,7 +141,7 @@ class Splats(_Run):
 
         if dispatch.fault("C++") is not None:
             raise ValueError("Colours of splats are fitted by compiled code: install a C++ compiler (g++ or clang++).")
-        scene = self.bake(details=False)  # splats do not show them
+        scene = self.bake(details=False)  # splats have none
         import torch
 
         from mmpi_ns.scene.windows import window_shares

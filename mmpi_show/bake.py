@@ -1,4 +1,4 @@
-"""Baking of a finished run: all its windows, with the bricks that its training views see, and the camera path."""
+"""Baking of a finished run: all windows, with the bricks that training views see, and the camera path."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ from mmpi_show.scene import most_of_copies, neighbours
 from mmpi_show.windows import BakedWindow, bake
 
 SLACK = 0.01
-"""What a texel's colours and features may be off by (before sigmoid and tanh), times the largest weight with which a
-training view sees it: of a colour, at most 0.0025 of a pixel."""
+"""Maximum error of a texel's colours and features (before sigmoid and tanh), times its largest weight in a training
+view: for a colour, at most 0.0025 of a pixel's."""
 MOST_LOOKED_AT = 60e6
-"""Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
+"""Maximum number of training pixels of a window that decide which bricks are visible; of more, every n-th row and
+column is used."""
 
 
 def load_model(load_config: Path, details: bool = False) -> Any:
@@ -48,7 +49,7 @@ def load_model(load_config: Path, details: bool = False) -> Any:
 
 
 def bake_of_model(model: MMPIModel, field: MMPIField) -> BakedWindow:
-    """A window of a model, as its images show it. Raises ValueError if it cannot be baked (says why)."""
+    """A window of a model, baked. Raises ValueError with the reason if it cannot be baked."""
     rendering, mean = model.config.rendering, model.exposures.mean
     exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
     return bake(field, rendering.threshold, BACKGROUNDS[rendering.background], field.blends, exposure)
@@ -60,10 +61,10 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
 
     Args:
         pipeline: of the run.
-        least: bricks in which no training view sees this weight are left out; 0 keeps all.
+        least: bricks without a sample of this weight in any training view are dropped; 0 keeps all.
 
     Raises:
-        ValueError: the model cannot be baked (says why).
+        ValueError: the model cannot be baked; the message says why.
     """
     model: MMPIModel = pipeline.model
     cameras: Cameras = pipeline.datamanager.train_dataset.cameras
@@ -102,8 +103,8 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
 
 
 def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
-    """The window with colours and features that take fewer bytes where training views see little of them. Densities
-    stay: what they lose shows before the bytes do.
+    """The window with colours and features that take fewer bytes where their weights in training views are small.
+    Densities are not changed: their errors are visible before bytes are saved.
 
     Args:
         window: as baked.
@@ -128,8 +129,8 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> dict[str, dict[str,
         count: number of test images, evenly spaced; all if there are fewer.
 
     Returns:
-        Of the renderers "exact" and "baked" psnr and ssim against the ground truth, seconds of processor time for a
-        frame, and "to_exact", the PSNR of its images against those of the exact one, dB.
+        For the renderers "exact" and "baked": psnr and ssim against the ground truth, processor seconds per frame, and
+        "to_exact", the PSNR against the exact renderer's images, dB.
     """
     dataset, metrics = pipeline.datamanager.eval_dataset, ImageMetrics("none")
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}

@@ -1,7 +1,7 @@
-"""The stored form of codes of bricks: differences from the codes around them, which gzip makes small (docs/export.md).
+"""Stored form of the codes of bricks: differences from neighbouring codes, which gzip compresses well (docs/export.md).
 
-Of the codes of a channel, every second row and column of a brick is stored apart from the others: a page that has these
-shows a brick at half of its resolution, and nothing is stored twice. ``ops/baked/reader.py`` joins them again.
+Every second row and column of a brick is stored first: with these, a page renders the brick at half of its resolution.
+Nothing is stored twice. ``ops/baked/reader.py`` joins them again.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ COARSE[::2, ::2] = True
 def smoothed_codes(
     codes: UInt8[Tensor, "B 8 8"], slack: UInt8[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]
 ) -> UInt8[Tensor, "B 8 8"]:
-    """Codes of a channel that take fewer bytes: those whose stored differences are at most their slack become what is
-    expected from the codes around them, so that 0 is stored.
+    """Codes of a channel that take fewer bytes: those whose stored differences are at most their slack are replaced by
+    the prediction from their neighbours, so that 0 is stored.
 
     Args:
         codes: of all bricks.
-        slack: what each may be off by. The first one of a brick is never off.
+        slack: maximum error of each code. The first one of a brick is exact.
         beside: the bricks right of each brick and below it, -1 for none.
     """
     exact, most_off = codes.numpy().astype(np.int16), slack.numpy()

@@ -1,4 +1,4 @@
-"""Details of training images in a baked scene: differences and depths as WebP, which browsers read (docs/export.md)."""
+"""Details of training images in a baked scene: residuals and depths as WebP, which browsers can read."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from torch.nn.functional import interpolate
 from mmpi_ns.rendering.details import DetailView
 
 STEP = 1 / 381
-"""Of codes of differences: two thirds of a grey level."""
+"""Step of the codes of residuals: two thirds of a grey level."""
 ZERO = 128
-"""Code of no difference."""
+"""Code of a residual of 0."""
 QUALITY = 80
-"""Of differences as WebP."""
+"""WebP quality of residuals."""
 COARSE = 4
-"""Rows and columns of an image for each of its depths."""
+"""Downscale factor of depths."""
 MOST_SIDE = 2048
-"""Pixels along a side of a difference; larger ones are kept smaller."""
+"""Maximum side of a residual image, pixels; larger ones are reduced."""
 
 
 @dataclass(frozen=True)
 class StoredView:
-    """A training image, as ``DetailView``, in the bytes that are written."""
+    """A training image, as ``DetailView``, encoded."""
 
     camera: tuple[float, ...]
     """As ``DetailView.camera``, for an image of this size."""
@@ -41,7 +41,7 @@ class StoredView:
 
 
 def stored_view(view: DetailView) -> StoredView:
-    """What is written of a training image."""
+    """The encoded form of a training image."""
     masked = view.image[..., 3:] < 0
     planes = torch.where(masked, 0.0, view.image[..., :3]).movedim(-1, 0)[None]
     height, width = planes.shape[2:]
@@ -64,7 +64,7 @@ def stored_view(view: DetailView) -> StoredView:
 
 
 def restored_view(view: StoredView, device: torch.device) -> DetailView:
-    """The training image that ``stored_view`` was made of, as nearly as it was kept.
+    """The training image of a ``StoredView``, as accurate as its codes.
 
     Raises:
         OSError: an image is damaged.

@@ -38,7 +38,8 @@ from mmpi_show.windows import BakedWindow
 FORMAT, VERSION = "mmpi-baked", 5
 HEADER = "scene.json"
 EARLY = 0.1
-"""Share of a window's bytes that come first: coarse texels of the bricks that training views see most of."""
+"""Share of a window's bytes for its first part: coarse texels of the bricks with the largest weights in training
+views."""
 PARTS_OF_VIEW = ("difference", "inverse")
 
 
@@ -76,11 +77,11 @@ class BakedScene:
     views: tuple[StoredView, ...] = ()
     """Details of the training images (docs/details.md)."""
     nearest: int = 0
-    """Number of training images that an image takes details from."""
+    """Number of training images whose details are added to an image."""
 
     @cached_property
     def details(self) -> Details:
-        """Those of the training images. Raises ValueError, when an image is needed that is damaged."""
+        """Details of the training images. Raises ValueError when a damaged one is needed."""
 
         def read(i: int, device: torch.device) -> DetailView:
             try:
@@ -94,7 +95,7 @@ class BakedScene:
 
     @torch_apart()
     def image(self, bundle: RayBundle) -> dict[str, Tensor]:
-        """Outputs of an image's rays [H, W], as of the model: with details, where there are some."""
+        """Outputs of an image's rays [H, W], as those of the model, with details if there are any."""
         device = bundle.origins.device
         outputs = render_in_chunks(bundle, SHOWN_RAYS, device, lambda rays: self.render(rays.origins, rays.directions))
         if not self.views:
@@ -193,7 +194,7 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
 
 
 def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
-    """What is stored of a window, in the order of its file; so many bytes of details come behind it."""
+    """Arrays of a window in the order of its file, which ``behind`` bytes of details follow."""
     mpis = window.mpis
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     channels = [mpis.density, *mpis.texels.unbind(-1)]
@@ -205,7 +206,7 @@ def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
     }
     beside_bricks = sum(len(_gzip(array)) for array in others.values())  # the first part has columns too
     room = EARLY * (len(_gzip(coarse_differences(coarse))) + len(_gzip(fine)) + beside_bricks + behind) - beside_bricks
-    # The bricks whose coarse codes come first: those that training views see most of, as many as fit into the room.
+    # The bricks whose coarse codes come first: those with the largest weights in training views, as many as fit.
     count = mpis.num_bricks
     order = torch.arange(count) if window.seen is None else window.seen.argsort(descending=True, stable=True)
     thousandth = torch.empty_like(order).index_copy(0, order, 1000 * torch.arange(count) // max(count, 1))
@@ -229,8 +230,8 @@ def _gzip(array: NDArray[Any]) -> bytes:
 
 
 def read_baked(folder: Path) -> BakedScene:
-    """Reads what ``write_baked`` wrote. Raises ValueError if it is missing, damaged or of another version (says what to
-    do)."""
+    """A scene that ``write_baked`` wrote. Raises ValueError with the remedy if it is missing, damaged or of another
+    version."""
     header = read_header(folder)
     try:
         windows, views = zip(*(_read_window(folder, row) for row in header["windows"]), strict=True)

@@ -15,8 +15,8 @@ from mmpi_show.files import HEADER, read_baked
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> Scene:
-    """A scene that ``mmpi-export bake`` or ``mmpi-export web`` wrote. Its images take about half of the time of exact
-    ones on a CPU and differ by 0.01 dB (docs/export.md).
+    """A scene written by ``mmpi-export bake`` or ``mmpi-export web``. It renders about twice as fast as the exact model
+    on a CPU and loses 0.01 dB (docs/export.md).
 
     Args:
         path: the folder.
@@ -24,7 +24,7 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Scene:
 
     Raises:
         InputError: there is no scene.
-        ValueError: its files are damaged (says which, and what to do).
+        ValueError: its files are damaged; the message names the file and the remedy.
     """
     if not (Path(path) / HEADER).is_file():
         raise InputError(

@@ -1,9 +1,9 @@
-"""Baked multi-plane images: bricks of 8-bit codes, and the columns that find them (docs/export.md has the format).
+"""Baked multi-plane images: bricks of 8-bit codes, and the columns that index them (format: docs/export.md).
 
-A baked brick contains 8 x 8 texels of one plane and shares its border texels with its neighbours, so that it covers
-7 x 7 cells and a lookup reads only one brick. A column consists of the bricks of one tile in ``WORD`` consecutive
-planes: a bit for each occupied plane, and the number of the first brick; the others follow it. One word thus tells a
-ray which of the next planes it can skip.
+A baked brick contains 8 x 8 texels of one plane and shares its border texels with its neighbours, so that it covers 7 x
+7 cells and a lookup reads only one brick. A column consists of the bricks of one tile in ``WORD`` consecutive planes: a
+bit for each occupied plane, and the number of the first brick; the others follow it. One word thus gives the empty
+planes that a ray can skip.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Shader:
 
 @dataclass(frozen=True, eq=False)
 class BakedMpis:
-    """The bricks of K MPIs that merge along a ray.
+    """The bricks of K MPIs.
 
     Args:
         mpis: frames and sizes, at the resolution that was baked.
@@ -81,7 +81,7 @@ class BakedMpis:
     density_codes: Codes
     channel_codes: tuple[Codes, ...]
     packed: dict[str, Any] = field(default_factory=dict)
-    """The scene in the layout of a compiled operation, which fills it once."""
+    """Cache of the scene in the layout of the compiled operation."""
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -93,7 +93,7 @@ class BakedMpis:
         return len(self.density)
 
     def first_column(self, k: int) -> int:
-        """Of MPI k; of those behind the last one, the number of columns."""
+        """First column of MPI k; for k = K, the number of columns."""
         return sum(math.prod(tiles_of(m)) for m in self.mpis[:k])
 
     def optical_depth(self, k: int, codes: Float[Tensor, "..."]) -> Float[Tensor, "..."]:

@@ -1,7 +1,7 @@
 """A baked window as flat Gaussians ("splats"), in the file format of 3D Gaussian splatting viewers.
 
-A texel seen by training rays becomes a Gaussian in its plane. Similar neighbours are merged. A splat's colour is fitted
-to the colours of rays through it, as a linear function of the direction: spherical harmonics of degree 1.
+A texel that training rays see becomes a Gaussian in its plane. Similar neighbours are merged. A splat's colour is
+fitted to the colours of rays through it, as a linear function of the direction: spherical harmonics of degree 1.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mmpi_show.windows import BakedWindow
 WIDTH = 0.35
 """Standard deviation of a splat, in texels."""
 THICKNESS = 0.01
-"""Of a splat, in its width."""
+"""Thickness of a splat, relative to its width."""
 LARGEST = 3
 """Maximum number of times that four neighbours are merged into one."""
 AGREEING_COLOR, AGREEING_FEATURE, AGREEING_ALPHA = 0.04, 0.2, 0.1
@@ -61,7 +61,7 @@ class Splats:
     rotations: Float[Tensor, "N 4"]
     """Unit quaternions (w, x, y, z): own axes to the world's."""
     alphas: Float[Tensor, "N"]
-    """At their middle."""
+    """Opacities at their centres."""
     colors: Float[Tensor, "N 4 3"]
     """Red, green and blue seen in direction d are these times (1, d)."""
 
@@ -79,7 +79,7 @@ class Splats:
 
 @dataclass(frozen=True)
 class _Texels:
-    """Texels of a window, each once, even if two bricks share it."""
+    """Texels of a window, each once, even if two bricks contain it."""
 
     places: Int[Tensor, "T 4"]
     """MPI, plane, row, column."""
@@ -98,8 +98,8 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
     Args:
         window: baked.
         poses: training cameras.
-        least: texels of less weight in all these views are left out.
-        most: maximum number of splats; those with the least weight are left out.
+        least: texels of less weight in all these views are dropped.
+        most: maximum number of splats; those with the largest weights are kept.
         rounds: of fitting colours to renderings of the window.
 
     Raises:

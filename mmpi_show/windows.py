@@ -1,7 +1,7 @@
-"""A baked window: a field as bricks of 8-bit codes with the network that shades its rays, and its rendering.
+"""A baked window: a field as bricks of 8-bit codes, the network that shades its rays, and its rendering.
 
 Blending looks up, for every sample, the reliability of each head that covers its position (paper sec. III-C). The
-resulting share depends on the position alone, so a baked texel stores the optical depth that is left.
+resulting share depends on the position alone, so a baked texel stores the blended optical depth.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ THINNEST = -12.0
 """Lower bound on the raw density of code 0; its softplus is 6e-6."""
 HIGHEST_COLOR, HIGHEST_FEATURE = 191, 96
 """Largest codes of a colour channel and of a feature. These lose 0.0007 of SSIM; 255 for both loses 0.0003 and is a
-fifth larger, 127 for both loses 0.0011 (docs/export.md)."""
+fifth larger, 127 for both loses 0.0011."""
 AT_ONCE_BRICKS = 2**13
 """Bricks that are baked together."""
 AT_ONCE = 2**18
-"""Rays whose weights are looked at together: all of a photo of 12 megapixels would take gigabytes."""
+"""Rays whose weights are computed together: all of a 12-megapixel photo would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +45,15 @@ class BakedWindow:
     shader: Shader
     ray_near: float
     threshold: float
-    """Samples of less weight are not shaded."""
+    """Weight below which samples are not shaded."""
     background: float = 0.5
-    """Grey level behind everything."""
+    """Grey level of the background."""
     farthest: float = 1e3
     """Distance that stands for infinity in depth images."""
     exposure: tuple[float, ...] = (1.0, 1.0, 1.0)
-    """Colours shown over those of the texels."""
+    """Exposure of images relative to the texels' colours."""
     seen: Float[Tensor, "B"] | None = None
-    """How much training views see of each brick: the largest weights in its texels, summed. None: not looked at."""
+    """Sum of the largest weights of each brick's texels in training views; None: not computed."""
 
     def render(
         self,
@@ -70,7 +70,7 @@ class BakedWindow:
             origins: of the rays.
             directions: of the rays, unit vectors.
             bounds: nears and fars of the rays; None: from ``ray_near`` to infinity.
-            background: colour behind everything; None: the window's own.
+            background: colour of the background; None: the window's.
         """
         rays = Rays(*(x.cpu() for x in (origins, directions, *(bounds or self.unbounded(origins)))))
         shown = show_baked(self.mpis, rays, self.threshold)
@@ -87,13 +87,13 @@ class BakedWindow:
         return {name: values.to(origins.device) for name, values in outputs.items()}
 
     def unbounded(self, origins: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
-        """Nears and fars of rays that see everything."""
+        """Nears and fars of unbounded rays."""
         nears = torch.full_like(origins[:, :1], self.ray_near)
         return nears, torch.full_like(nears, torch.inf)
 
     def peaks(self, views: Iterable[tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]) -> Float[Tensor, "B 8 8"]:
-        """Largest weight of any sample of some views, given by origins and unit directions of their rays, in each
-        texel."""
+        """Largest weight of each texel among the samples of some views, given by origins and unit directions of their
+        rays."""
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
             for o, d in zip(*(x.split(AT_ONCE) for x in view), strict=True):
@@ -135,9 +135,9 @@ def bake(
 
     Args:
         model_field: what to bake.
-        threshold: samples of less weight will not be shaded.
-        background: grey level behind everything.
-        blends: texels keep the optical depths that blending by reliability leaves at them.
+        threshold: weight below which samples are not shaded.
+        background: grey level of the background.
+        blends: texels store optical depths blended by reliability.
         exposure: of images, relative to the field's.
 
     Raises:
@@ -158,7 +158,7 @@ def bake(
     channels = tuple(Codes.spanning(*each) for each in ranges)
     columns, density, texels, count = [], [], [], 0
     for k in heads:
-        for part in reached[k].nonzero().split(AT_ONCE_BRICKS):  # what shows nothing is left out
+        for part in reached[k].nonzero().split(AT_ONCE_BRICKS):  # bricks without stored texels are dropped
             codes = density_codes.encode(_raw(model_field, k, part, shares))
             reached[k][tuple(part.T)] = codes.amax((-1, -2)) > 0
         stored, places = columns_from(reached[k], count)
@@ -178,7 +178,7 @@ def bake(
 
 
 def _reached(grid: TexelGrid) -> Bool[Tensor, "P Y X"]:
-    """Baked bricks of a head that hold a stored texel."""
+    """Baked bricks of a head that contain a stored texel."""
     stored = grid.own_tiles.cpu() > 0
     for axis, size in ((1, grid.height), (2, grid.width)):
         first = torch.arange(-(-(size - 1) // CELLS)) * CELLS

@@ -1,4 +1,4 @@
-// What the training images near a camera show beyond the field (docs/details.md), as ops/details.
+// Residuals of the training images near a camera (docs/details.md), as ops/details.
 uniform int seen; // training images
 uniform float seenStep, infinity; // of codes of differences; inverse distance that stands for infinity
 uniform vec4 seenImage[SEEN];  // width, height, layer, factor on weights
@@ -9,7 +9,7 @@ uniform vec4 seenBend[SEEN];   // k1, k2, k3, k4
 uniform vec4 seenRest[SEEN];   // p1, p2, whether a fisheye, largest distance from the centre
 uniform sampler2DArray differences, depths;
 
-// Pixel of a direction in the axes of a training image; false if it does not have it.
+// Pixel of a direction in the axes of a training image; false if it lies outside.
 bool project(int i, vec3 local, out vec2 at) {
   vec4 rest = seenRest[i], k = seenBend[i];
   float ahead = -local.z, radius = length(local.xy);
@@ -29,7 +29,7 @@ vec3 codesAt(sampler2DArray images, vec2 place, vec2 size, float layer) {
   return 255.0 * textureLod(images, vec3(at, layer), 0.0).rgb;
 }
 
-// What to add to the radiance of a ray whose surface is at this inverse distance.
+// The detail added to the radiance of a ray whose surface is at this inverse distance.
 vec3 details(vec3 direction, float inverse, vec3 radiance) {
   vec3 total = vec3(0.0);
   float weight = LEAST_WEIGHT;
@@ -51,7 +51,7 @@ vec3 details(vec3 direction, float inverse, vec3 radiance) {
   return STRENGTH * total / weight;
 }
 
-// A colour with details; a ray that ends in the background is marched anew to know its depth.
+// A colour with details; a ray that ends in the background is marched again for its depth.
 vec3 detailed(vec3 color, vec3 direction, float surface) {
   if (seen == 0 || mass <= 0.0) return color;
   float opacity = 1.0 - light;

@@ -1,4 +1,4 @@
-// Details: what training images near the camera show beyond the field. Decoded when a camera comes near them.
+// Details: residuals of training images near the camera. Decoded when a camera comes near them.
 "use strict";
 
 const COARSE = 4; // rows and columns of an image for each of its depths
@@ -83,7 +83,7 @@ class Details {
     this.pending.delete(view);
   }
 
-  // Whether all is there that a camera needs.
+  // Whether all images that a camera needs are loaded.
   ready(camera) { return this.chosen(camera).every(({ view }) => this.layers.includes(view)); }
 
   // Uniforms and textures of a picture, for the program in use; none where it shows the field alone.

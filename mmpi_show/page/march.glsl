@@ -1,4 +1,4 @@
-// One window of a baked scene: every ray meets the bricks of all MPIs in order of distance, gathers codes until it is
+// One window of a baked scene: every ray intersects the bricks of all MPIs in order of distance, sums codes until it is
 // opaque, and is shaded once. What stands between "each" and "end" is repeated for every MPI, with its number for K_.
 precision highp float;
 precision highp int;

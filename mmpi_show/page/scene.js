@@ -368,7 +368,7 @@ class WindowOnCard {
   }
 }
 
-// How much each window says of a ray that starts at `eye` (as scene/windows.py): full in its ball, falling off beyond.
+// Share of each window in a ray that starts at `eye` (as scene/windows.py): full in its ball, falling off beyond.
 function windowShares(rows, eye) {
   if (rows.length === 1) return [1];
   const beyond = rows.map((r) => Math.hypot(...r.center.map((c, a) => c - eye[a])) - r.radius);

@@ -1,4 +1,4 @@
-"""Rays through baked multi-plane images: what each shows, front to back, until it is opaque, and its colour.
+"""Rays through baked multi-plane images, front to back until they are opaque, and their colours.
 
 Both are defined by ``reader.py``, in float64.
 """
@@ -29,12 +29,12 @@ from mmpi_show.scene import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, ti
 
 @operation()
 def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tensor, "B 8 8"] | None = None) -> Shown:
-    """What each ray gathers, front to back.
+    """Sums of each ray's samples, front to back.
 
     Args:
         scene: the bricks.
-        rays: R rays; all MPIs answer them.
-        threshold: samples of less weight are left out of the sums.
+        rays: R rays, rendered by all MPIs.
+        threshold: weight below which samples are not summed.
         peaks: of every texel, raised to the largest weight of a sample that reads it.
     """
     window: reader.Window = {  # as the reader has it from a file
@@ -77,7 +77,7 @@ def shade_baked(
     mass: Float[Tensor, "R 1"],
     directions: Float[Tensor, "R 3"],
 ) -> Float[Tensor, "R 3"]:
-    """Colours of rays from what they gathered.
+    """Colours of rays from their sums.
 
     Args:
         shader: the network.
@@ -99,7 +99,7 @@ def show_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Ten
         count, bricks, channels = len(scene.mpis), scene.num_bricks, len(scene.channel_codes)
         assert channels <= MOST_CHANNELS
         codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
-        # Light that passes a sample of each MPI, at codes 0, 1/8, 2/8, ... 255.
+        # Transmittance of a sample of each MPI, at codes 0, 1/8, 2/8, ... 255.
         through = [torch.exp(-scene.optical_depth(k, codes)).float().contiguous() for k in range(count)]
         stacks = []
         for k, mpi in enumerate(scene.mpis):
@@ -131,7 +131,7 @@ def show_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Ten
 def shade_baked_on_cpu(shader: Shader, gathered: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
     num_rays, channels = gathered.shape
     numbers, inputs = [], channels + 3 * (1 + 2 * shader.direction_octaves)
-    for weights, biases in shader.layers:  # alive until the kernel has run
+    for weights, biases in shader.layers:  # referenced until the kernel has run
         numbers.append((shaped(weights, len(biases), inputs), shaped(biases, len(biases))))
         inputs = len(biases)
     assert inputs == COLORS, f"a network of {inputs} outputs where a colour is read"

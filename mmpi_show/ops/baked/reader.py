@@ -2,8 +2,8 @@
 
     python mmpi_show/ops/baked/reader.py FOLDER NUMBER image.npy      # renders camera NUMBER of the path
 
-Float64, every plane of every MPI, and no code of the rest: an example for other viewers, what all tests of bricks
-compare with, and what renders them where there is no compiler.
+Float64, every plane of every MPI, without other code of this package: an example for other viewers, the reference of
+the tests, and the form that runs where there is no compiler.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ CORNERS = np.array([0, 1, 8, 9])
 
 
 class Samples(NamedTuple):
-    """What R rays cross on S planes, nearest first; weight 0 where nothing is stored or the ray is over."""
+    """Samples of R rays on S planes, nearest first; weight 0 in empty bricks and where the ray is terminated."""
 
     inverse_t: np.ndarray  # [R, S] 1 / distance
     weights: np.ndarray  # [R, S]
@@ -69,7 +69,7 @@ def decode(window: Window) -> np.ndarray:
 
 
 def brick_numbers(window: Window, mpi: dict[str, Any]) -> np.ndarray:
-    """Brick of every tile [planes, rows, columns] of an MPI; -1 where nothing is stored."""
+    """Brick of every tile [planes, rows, columns] of an MPI; -1 where it is empty."""
     rows, columns, words = -(-(mpi["height"] - 1) // 7), -(-(mpi["width"] - 1) // 7), -(-mpi["planes"] // 32)
     first = mpi["first_column"]
     bits, start = np.moveaxis(window["columns_array"][first : first + words * rows * columns].astype(np.int64), 1, 0)
@@ -104,7 +104,7 @@ def camera_rays(pose: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cross(window: Window, mpi: dict[str, Any], rays: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """1 / distance and optical depth [R, P], texels and their shares [R, P, 4] where rays cross an MPI's planes."""
+    """1 / distance and optical depth [R, P], texels and their shares [R, P, 4] where rays intersect an MPI's planes."""
     origins, directions, near, far = rays
     axes, numbers = np.array(mpi["axes"]), brick_numbers(window, mpi)
     (ox, oy, oz), (dx, dy, dz) = (
@@ -114,7 +114,7 @@ def _cross(window: Window, mpi: dict[str, Any], rays: tuple[np.ndarray, ...]) ->
     last = 0.0 if mpi["far"] is None else 1 / mpi["far"]
     planes = np.arange(mpi["planes"])  # evenly spaced in disparity w from 1 / near to 1 / far
     w = last + (1 / mpi["near"] - last) * (1 - planes / steps)
-    ahead = (dz > 1e-6) & (w * oz < 1)  # it does not run along the planes, and this one does not lie behind
+    ahead = (dz > 1e-6) & (w * oz < 1)  # not parallel to the planes, and this one lies ahead
     dz = np.where(dz > 1e-6, dz, 1.0)
     inverse_t = w * dz / np.where(ahead, 1 - w * oz, 1.0)
     u0, u1, v0, v1 = mpi["extent"]
@@ -150,7 +150,7 @@ def march(
     texels, shares = (np.take_along_axis(x, order[..., None], 1) for x in (texels, shares))
     after = np.exp(-tau.cumsum(1))
     before = np.concatenate([np.ones_like(after[:, :1]), after[:, :-1]], 1)
-    weights = np.where(before > 1e-2, before * -np.expm1(-tau), 0.0)  # a ray is over where less light is left
+    weights = np.where(before > 1e-2, before * -np.expm1(-tau), 0.0)  # a ray is terminated below this transmittance
     return Samples(inverse_t, weights, mpis, texels, shares, after[:, -1:])
 
 

@@ -1,4 +1,4 @@
-"""Gaussians seen by a camera as viewers of 3D Gaussian splatting show them: the image, and what each gave to it.
+"""Rasterisation of Gaussians as in viewers of 3D Gaussian splatting: the image, and each one's contribution.
 
 Only ``mmpi-export splats`` needs it, and it has no form in plain torch. Source: Kerbl et al. (2023), sec. 4.
 """
@@ -41,7 +41,7 @@ class View(NamedTuple):
 
 
 def splat_image(gaussians: Gaussians, view: View, colors: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 4"]:
-    """Red, green, blue without a background, and the light that passes.
+    """Red, green, blue without a background, and the transmittance.
 
     Args:
         gaussians: what is seen.
@@ -60,14 +60,14 @@ def splat_errors(
     shown: Float[Tensor, "H W 3"],
     errors: Float[Tensor, "H W 3"],
 ) -> Float[Tensor, "N 6"]:
-    """How colours and opacities should change for an image to change by its errors.
+    """Changes of colours and opacities that reduce an image's errors.
 
     Args:
         gaussians: what is seen.
         view: the camera.
         colors: of each Gaussian, as this camera sees it.
-        shown: the image with its background.
-        errors: what is missing in it.
+        shown: the rendered image with its background.
+        errors: target minus rendered image.
 
     Returns:
         Of each Gaussian the sum over pixels of its weight there times (error, 1), the adjoint of ``splat_image``. Then,
@@ -86,5 +86,5 @@ def _run(function: Callable[..., Tensor], gaussians: Gaussians, view: View, out:
     numbers = map(float, (*view.to_world.flatten(), *view.focal, *view.center))
     inputs = dense(*gaussians, *tensors.values())
     camera, seen = structs((*numbers, *map(ctypes.c_int32, view.size))), structs((count, *inputs[:3]))
-    values = (camera, seen, *inputs[3:], out)  # alive until it has run
+    values = (camera, seen, *inputs[3:], out)  # referenced until it has run
     getattr(library(OPS), f"mmpi_{function.__name__}")(*arguments(values))
