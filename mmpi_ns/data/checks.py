@@ -1,4 +1,4 @@
-"""Checks of the input before nerfstudio reads it, whose own errors name neither frame nor remedy."""
+"""Checks of the input before nerfstudio reads it, whose errors name neither frame nor remedy."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ FLOAT64_SAME = 1e-12
 ROTATION_SLACK = 0.01
 """Tolerance on the length of the axes of a pose, which should be 1."""
 MAP_COORDINATES = 2000.0
-"""Distance of the cameras from the origin, over their extent, from which 32 bits do not hold their places."""
+"""Distance of the cameras from the origin, relative to their extent, above which float32 cannot represent their
+positions."""
 FAR_OFF, FEW = 1000.0, 0.1
 """A camera this many times as far away as all but a few others, this fraction of them, is a mistake."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 PATHS = ("file_path", "mask_path", "depth_file_path")
 NO_PATH = "[\0\ud800-\udfff]"
-"""Not in a path: NUL, and halves of characters, which also stand for bytes of a file's name that are no UTF-8."""
+"""Invalid in a path: NUL, and lone surrogates, which also stand for bytes of a file name that are not UTF-8."""
 PARSER_OPTIONS = {
     "scale_factor": Number(0, 1e9, above=True),
     "scene_scale": Number(0, above=True),
@@ -50,13 +51,13 @@ SIDE = Number(1, 65536)
 FOCAL_SHARES = (1e-3, 1e4)
 """Plausible focal lengths, in widths of the image."""
 WHOLE_SPHERE = {"fl_x": 0.5, "fl_y": 1.0}
-"""Focal lengths of an equirectangular image all round, in sides of the image; smaller ones would show it twice."""
+"""Minimum focal lengths of an equirectangular image, in sides of the image; smaller ones would repeat it."""
 MODELS = {
     name: kind for name, kind in CAMERA_MODEL_TO_TYPE.items() if not name.startswith(("OMNIDIRECTIONALSTEREO", "VR180"))
 }
-"""Names of camera models; those of image pairs have no pose for each image."""
+"""Names of camera models; those of image pairs have no pose per image."""
 LONG_LENS = 12
-"""Coefficients that nerfstudio needs of a FISHEYE624."""
+"""Number of coefficients of a FISHEYE624 in nerfstudio."""
 CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 STRETCH = 10.0
@@ -99,7 +100,7 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
 
 
 def names_of_copies(folder: Path) -> str:
-    """Names of a capture's folders of downscaled copies, for a sentence."""
+    """Names of a capture's folders of downscaled copies, as text."""
     return ", ".join(sorted(p.name for p in folder.glob("images_*") if p.is_dir())) or "no copies"
 
 
@@ -110,7 +111,7 @@ def say_once(text: str) -> None:
 
 
 def colmap_models(folder: Path) -> list[str]:
-    """Usual places below a folder that hold a COLMAP model."""
+    """Usual folders of COLMAP models that exist below a folder."""
     return [
         place
         for place in ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "dense/sparse")

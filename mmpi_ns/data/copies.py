@@ -1,4 +1,4 @@
-"""Downscaled copies of images: what they were made from, and cameras that fit them exactly."""
+"""Downscaled copies of images: their originals, and cameras that fit them exactly."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ def original_of(file: Path) -> tuple[Path, int]:
 
 
 def size_of(file: Path) -> NDArray[np.float64]:
-    """Width and height of an image file. Raises InputError if it cannot be read (names it)."""
+    """Width and height of an image file. Raises InputError that names the file if it cannot be read."""
     with opened(file) as image:
         return np.array(image.size, np.float64)
 
 
 def shown_size(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Width and height of a file of this size as its camera shows it, which may lack a last row or column, or be of
+    """Width and height of a file of this size according to its camera, which may lack a last row or column, or have
     another size if files are reduced when they are read."""
     return np.where(np.abs(size - camera) <= 1, size, camera)
 
 
 def whole_of(file: Path, size: NDArray[np.float64]) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
-    """What a downscaled copy was made from, its size, and its pixels (columns, rows) in one of the copy.
+    """Original of a downscaled copy, its size, and its pixels (columns, rows) per pixel of the copy.
 
     A file, of this width and height, without an original, or whose original has another shape, stands for itself.
     Raises InputError naming an image file that cannot be read.

@@ -1,4 +1,4 @@
-"""nerfstudio's data manager: training batches, drawn ahead, and what the model needs to know of a capture."""
+"""nerfstudio's data manager: training batches, drawn one step ahead, and the priors of a capture for the model."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ Batch = tuple[TrainingRays, dict[str, Any]]
 CAPTURE = "capture"
 """Key of the ``Capture`` in the data set's metadata, by which nerfstudio hands it to the model."""
 MANY_DEPTHS = 0.4
-"""Share of the training pixels with a depth prior from which training starts with surfaces: two thirds have one in most
-captures, a fifth in one whose images hardly overlap."""
+"""Minimum share of the training pixels with a depth prior for training to start from surfaces: two thirds have one in
+most captures, a fifth if images hardly overlap."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """What a model needs to know of the training images."""
+    """Data of the training images for the model."""
 
     observations: Observations
-    """For placement."""
+    """Observations for placement."""
     views: TrainingViews
     """Positions and fields of view of the cameras."""
     rays_per_step: int
@@ -62,11 +62,11 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
 
     _target: type = field(default_factory=lambda: MMPIDataManager)
     train_num_rays_per_batch: int = 4096
-    """Pixel rays a training step."""
+    """Pixel rays per training step."""
     priors: PriorsConfig = field(default_factory=PriorsConfig)
-    """What the images tell beside their colours."""
+    """Priors of the images."""
     keypoint_rays: int = 384
-    """Extra rays a step through SfM keypoints of training images, if few pixels have a depth shared by two images
+    """Extra rays per step through SfM keypoints of training images, if few pixels have a depth that two images share
     (scenes with tracks only)."""
     new_view_share: float = 0.75
     """Rays of new views for each pixel ray: from between two training cameras to points that both see at the same
@@ -84,20 +84,20 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     config: MMPIDataManagerConfig
     _thread: ClassVar = ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
-    """Draws the rays of the next step during this one: small operations of torch, which take the time of one core."""
+    """Thread that draws the rays of the next step during this one: small torch operations, which use one core."""
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.priors: Priors | None = None
-        """Of a training; None where the plan comes from a checkpoint."""
+        """Priors of a training; None where the plan comes from a checkpoint."""
         self.sources: RaySources | None = None
-        """Sources that a step draws from now."""
+        """Sources of the current steps."""
         self.share_of_rays = 1.0
-        """Share of the pixel rays that a step draws now, with new views in proportion."""
+        """Share of the pixel rays in the current steps, with new views in proportion."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
         self.draws = Generators(config.seed, kwargs.get("device", "cpu"))
         self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
-        """Rays of the next step with what they are drawn from, their step and number."""
+        """Rays of the next step with their sources, step and number."""
         parser: Any = config.dataparser
         check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
@@ -113,7 +113,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.config.seed = config.seed
 
     def create_train_dataset(self) -> MMPIDataset:
-        # First, so that what is wrong with images is said before minutes of matching.
+        # First, so that errors of images are reported before minutes of matching.
         self._test_images = self._test_dataset()
         fit_cameras(self.train_dataparser_outputs, self._downscale_factor)
         self.train_dataset = dataset = super().create_train_dataset()
@@ -149,12 +149,13 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     @cached_property
     def observations(self) -> Observations:
-        """Observations of the training cameras. Only training searches the images, later perhaps absent, for points."""
+        """Observations of the training cameras. Only training reads the images, which may be absent later, for
+        points."""
         return self.maker.observe(find_points=False) if self.priors is None else self.priors.observations
 
     @property
     def _downscale_factor(self) -> int | None:
-        """Of the images that the data parser has listed."""
+        """Downscale factor of the images that the data parser has listed."""
         return getattr(self.dataparser, "downscale_factor", None) or getattr(self.dataparser, "_downscale_factor", None)
 
     def _test_dataset(self) -> MMPIDataset:
@@ -173,7 +174,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def setup_train(self) -> None:
         """Reads the pixels into memory, unless there are too many, instead of nerfstudio's image cache."""
-        # Samples nothing: ns-export sets its batches' size here.
+        # Draws no pixels: ns-export sets its batch size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         if self._pixels.sum() <= self.config.resident_pixels and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
@@ -190,7 +191,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         say_once(self.sources.describe(self.get_train_rays_per_batch()))
 
     def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
-        """The pixels, new views and keypoints of all training cameras, or of some; notes if pixels are left out."""
+        """Pixels, new views and keypoints of all training cameras, or of some; prints if only a subset of the pixels is
+        used."""
         config, images = self.config, list(range(len(self.train_dataset))) if cameras is None else cameras.tolist()
         total, most = self._pixels[images].sum(), int(config.resident_pixels)
         if 0 < most < total:
@@ -223,13 +225,13 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return f"Capture: {'; '.join(parts)}."
 
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
-        """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
+        """Maximum bytes of the training pixels in memory while these cameras are in use."""
         if self._resident is not None:
             return self._resident.pixels.nbytes
         sizes = self._pixels if cameras is None else self._pixels[cameras]
         dataset, most = self.train_dataset, int(self.config.resident_pixels)
         share = min(1.0, most / sizes.sum()) if most else 1.0
-        # As in ``PixelPool``: colour, place in the image where it must be kept, and depth.
+        # As in ``PixelPool``: colour, position in the image where it must be stored, and depth.
         place, depth = share < 1 or dataset.has_masks, self.priors is not None and self.priors.depths is not None
         each = (4 if dataset.has_alpha else 3) + 4 * place + 4 * depth
         return each * sum(int(share * size) for size in sizes.tolist())
@@ -268,7 +270,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         Outside training (ns-export always requests step 0) only pixel rays, different ones in each call.
         """
         self.train_count += 1
-        if self.sources is None:  # nobody said which window
+        if self.sources is None:  # no window was chosen
             self.use_cameras(None)
         sources, batch = self.sources, None
         pixel_rays = max(1, round(self.share_of_rays * self.get_train_rays_per_batch()))

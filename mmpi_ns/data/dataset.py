@@ -39,7 +39,7 @@ class MMPIDataset(InputDataset):
         return False
 
     moving: Sequence[NDArray[np.bool_]] | None = None
-    """Masks of what moves in each image [H, W], used in images that have no mask file."""
+    """Masks of moving objects in each image [H, W], used in images that have no mask file."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         if not dataparser_outputs.cameras.shape:  # nerfstudio's parser for Instant NGP: [4, 3] of a 4 x 4 matrix
@@ -109,8 +109,8 @@ class MMPIDataset(InputDataset):
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def check_files(self) -> None:
-        """Raises InputError for an image that cannot be opened, or is not as large as its camera, and for a depth image
-        that is missing; reads no pixels."""
+        """Check of all files without reading pixels. Raises InputError for an image that cannot be opened or has
+        another size than its camera, and for a missing depth image."""
         for file in map(Path, self.metadata.get("depth_filenames") or ()):
             try:
                 file.stat()
@@ -139,7 +139,7 @@ class MMPIDataset(InputDataset):
         return height, width
 
     def usable(self, image_idx: int) -> NDArray[np.bool_]:
-        """Where an image is not masked. [H, W]"""
+        """Mask of the usable pixels of an image. [H, W]"""
         if self.mask_files[image_idx] is not None:
             return self.get_data(image_idx, image_type="uint8")["mask"][..., 0].numpy().astype(bool)
         if self.moving is not None:
@@ -148,10 +148,10 @@ class MMPIDataset(InputDataset):
 
 
 def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
-    """Depths of a sensor along the optical axis [h, w], scene units; 0 where unknown.
+    """Depths of a sensor along the optical axis [h, w], scene units; 0 where there is none.
 
     Args:
-        file: 16-bit PNG or .npy (nerfstudio's depth_file_path); InputError names one that holds something else.
+        file: 16-bit PNG or .npy (nerfstudio's depth_file_path); InputError names a file with other content.
         unit: scene units of a depth of 1 (nerfstudio's depth_unit_scale_factor).
     """
     try:
@@ -167,7 +167,7 @@ def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
 
 
 def image_and_mask(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Colours of an image [H, W, C] and where it may be used [H, W]."""
+    """Colours of an image [H, W, C] and mask of its usable pixels [H, W]."""
     data = dataset.get_data(i, image_type="uint8")
     image = data["image"].numpy()
     usable = np.ones(image.shape[:2], np.uint8) if "mask" not in data else data["mask"][..., 0].numpy().astype(np.uint8)

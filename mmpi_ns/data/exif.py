@@ -26,9 +26,10 @@ def tags_of(image: Image.Image) -> Image.Exif:
 
 
 def light_of(file: Path) -> float:
-    """Light that an image got by its EXIF, in arbitrary units: time * sensitivity / aperture squared.
+    """Exposure of an image by its EXIF, in arbitrary units: time * sensitivity / aperture squared.
 
-    NaN where no time is noted, as in frames of videos, or the file is damaged, which is told when its pixels are read.
+    NaN without an exposure time, as in frames of videos, or if the file is damaged, which is reported when its pixels
+    are read.
 
     Source: CIPA DC-008 (Exif 2.32), tags ExposureTime, PhotographicSensitivity and FNumber.
     """
@@ -51,7 +52,7 @@ def positive_number(value: Any) -> float | None:
 
 
 def kept_tags(image: Image.Image) -> Image.Exif:
-    """The tags of a photo about its body and its shot, for a turned, converted or downscaled copy."""
+    """EXIF tags of a photo about camera and exposure, for a rotated, converted or downscaled copy."""
     source, kept = tags_of(image), Image.Exif()
     kept.update({tag: source[tag] for tag in BODY if tag in source})
     shot = source.get_ifd(ExifTags.IFD.Exif)

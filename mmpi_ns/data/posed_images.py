@@ -1,4 +1,4 @@
-"""Images with their cameras and lenses, as whatever compares images needs them."""
+"""Images with their cameras and lenses, for image comparison."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class PosedImages:
         return bool(np.broadcast_to(self.fisheye, len(self.sizes))[i])
 
     def is_bent(self, i: int) -> bool:
-        """True if the lens of image i is not a pinhole's; a fisheye never is, even if all its terms are 0."""
+        """Whether the lens of image i is not a pinhole; a fisheye never is, even if all its terms are 0."""
         return self.is_fisheye(i) or bool(self.distortion[i].any())
 
 
@@ -68,8 +68,8 @@ def at_full_size(images: PosedImages) -> PosedImages:
 
 
 def camera_observations(cameras: Cameras, files: Sequence[Path]) -> Observations:
-    """Training cameras as they are used, without points. Raises InputError naming the image whose pose or intrinsics
-    cannot be used."""
+    """Training cameras in the scene's frame, without points. Raises InputError naming the image whose pose or
+    intrinsics cannot be used."""
     poses = np.array(cameras.camera_to_worlds.double().cpu())
     flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
     usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)

@@ -1,6 +1,6 @@
-"""What the images of a capture tell beside their colours: a record that training, placement and evaluation read.
+"""Priors of a capture: the record that training, placement and evaluation read.
 
-Here it is made of the cameras alone; ``mmpi_priors`` searches the images for the rest.
+Here it is made from the cameras alone; ``mmpi_priors`` computes the rest from the images.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ Codes = NDArray[np.int16]
 UNKNOWN, OCTAVE = -(2**15), 1024
 """Code of a number that is 0, and codes in an octave."""
 STRIP = 1 << 16
-"""Numbers that are coded at once."""
+"""Number of values coded at once."""
 AGREEMENT = 0.8
-"""Gains are used if they lower the median error of pairs that were left out to less than this fraction,"""
+"""Gains are used if they lower the median error of held-out pairs to less than this fraction,"""
 SPAN, SPAN_ERRORS = 0.03, 6.0
 """and if 80 % of the log gains span at least this, and this many of their errors."""
 MOST_HEADROOM = 0.5
@@ -40,7 +40,8 @@ MOST_HEADROOM = 0.5
 
 @dataclass(frozen=True)
 class DepthPriors:
-    """For every training image: inverse distance from the camera, 0 where unknown, and its expected error.
+    """Depth priors of every training image: inverse distance from the camera, 0 where there is none, and its expected
+    error.
 
     Stored in 16 bits each; the relative rounding error of a distance is at most 0.034 %.
     """
@@ -54,7 +55,7 @@ class DepthPriors:
 
     @cached_property
     def share(self) -> float:
-        """Share of all pixels whose distance is known."""
+        """Share of all pixels with a distance."""
         count = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
         return count / max(1, sum(m[..., 0].size for m in self.codes))
 
@@ -90,13 +91,13 @@ class Gains:
     falloff: Float[ndarray, "2 3"]
     """Log colour per r^2 and r^4, towards the corners."""
     disagreement: float
-    """Median difference of log colours in pairs of images that were left out, without gains,"""
+    """Median difference of log colours in held-out pairs of images, without gains,"""
     corrected: float
     """and with them."""
 
     @property
     def span(self) -> float:
-        """Ratio of green factors that 80 % of the images lie between."""
+        """Ratio of the green factors that bound 80 % of the images."""
         low, high = np.quantile(self.factors[:, 1], [0.1, 0.9])
         return float(high / low)
 
@@ -122,24 +123,25 @@ class Gains:
 
     @property
     def from_field(self) -> Float[ndarray, "N 3"]:
-        """Factors from the colours of a field, which are at most 1, to those of the images: the field is as dark as the
-        darkest image, or half as bright as the reference, so that it holds what only dark images do not clip."""
+        """Factors from the colours of a field, which are at most 1, to those of the images: the field has the exposure
+        of the darkest image, or half of the reference, so that it can represent colours that only dark images do not
+        clip."""
         return self.factors / np.clip(self.factors.min(), MOST_HEADROOM, 1)
 
     @property
     def confirmed(self) -> bool:
-        """Whether pairs that were left out agree better with the gains than without."""
+        """Whether held-out pairs agree better with the gains than without."""
         return self.corrected < AGREEMENT * self.disagreement
 
     @property
     def matter(self) -> bool:
-        """Whether images differ by more than errors explain, and the gains are confirmed."""
+        """Whether images differ by more than the errors of the gains, and the gains are confirmed."""
         return bool(self.confirmed and np.log(self.span) > max(SPAN, SPAN_ERRORS * float(np.median(self.errors))))
 
 
 @dataclass(frozen=True)
 class SharedPoints:
-    """Points that two training images show at the same depth, each as a pixel of the first."""
+    """Points that two training images see at the same depth, each as a pixel of the first."""
 
     pixels: Int[Tensor, "P 3"]
     """Image, row and column in the first."""
@@ -186,34 +188,34 @@ class SharedPoints:
 
 @dataclass(frozen=True)
 class Priors:
-    """What M training images tell beside their colours."""
+    """Priors of M training images."""
 
     observations: Observations
-    """Cameras, SfM points and who saw them."""
+    """Cameras, SfM points and their keypoints."""
     placement: Observations
-    """The same with one depth of each image cell: what placement weighs."""
+    """The same with one depth of each image cell, for placement."""
     depths: DepthPriors | None = None
-    """Depth and expected error of pixels; None if nobody looked."""
+    """Depth and expected error of pixels; None if they were not computed."""
     masks: Sequence[NDArray[np.bool_]] | None = None
-    """What moves in each image [H, W]; None if nothing does."""
+    """Masks of moving objects in each image [H, W]; None without any."""
     movers: str = ""
-    """How much of the images moves, in a sentence; empty if nobody looked."""
+    """Share of moving pixels, in a sentence; empty if it was not computed."""
     gains: Gains | None = None
     """Exposures of the images; None if they are equal."""
     new_views: Callable[..., tuple[SharedPoints | None, str]] | None = None
     """Points that two of some images see at the same depth, and the reason where there are none, for images, a device
-    and exposures; None if nobody looked."""
+    and exposures; None if they were not computed."""
 
 
 @dataclass
 class PriorsConfig(InstantiateConfig):
-    """Settings of what is told of a capture beside its colours: here, nothing but the cameras."""
+    """Settings of the priors of a capture: here, cameras alone."""
 
     _target: type = field(default_factory=lambda: PriorsMaker)
 
 
 class PriorsMaker:
-    """Makes the record of the cameras alone. ``mmpi_priors`` has one that searches the images.
+    """Maker of the record from the cameras alone. ``mmpi_priors`` has one that uses the images.
 
     Args:
         config: which priors.
@@ -236,7 +238,7 @@ class PriorsMaker:
         self.outputs, self.dataset, self.parser, self.rays, self.seed = outputs, dataset, parser, rays, seed
 
     def observe(self, find_points: bool) -> Observations:
-        """Training cameras and SfM points. Without ``find_points`` images, which may be absent, are not searched."""
+        """Training cameras and SfM points. Without ``find_points``, images are not read and may be absent."""
         return camera_observations(self.dataset.cameras, self.dataset.image_filenames)
 
     def make(self) -> Priors:
@@ -253,8 +255,8 @@ class PriorsMaker:
         observed: Float[Tensor, "H W 3"],
         outputs: dict[str, Tensor],
     ) -> Float[Tensor, "3"] | None:
-        """Exposure of an evaluated image, by surfaces that training images near it show too; None if they show nothing,
-        or are gone.
+        """Exposure of an evaluated image, by surfaces that training images near it see too; None without any, or if the
+        images are missing.
 
         Args:
             observations: of the training cameras.

@@ -1,4 +1,4 @@
-"""Sources of the rays of a training step: pixels, points that two images share, and SfM keypoints."""
+"""Sources of the rays of a training step: pixels, points that two images see, and SfM keypoints."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mmpi_ns.utils.random_draws import generator
 
 @dataclass(frozen=True)
 class PixelPool:
-    """The pixels P of some images, image by image, on the device; those of images I are drawn.
+    """The P pixels of I images, image by image, on the device.
 
     If all pixels of an image are here, row and column of a pixel follow from its index.
     """
@@ -40,7 +40,7 @@ class PixelPool:
     places: Int[Tensor, "P"] | None
     """row * width + column of each pixel; None if all pixels are here."""
     depths: Int16[Tensor, "P 2"] | None
-    """Inverse distance of each pixel and its expected error, as ``depth_priors.packed``; None if none is known."""
+    """Inverse distance of each pixel and its expected error, by ``priors.packed``; None without any."""
 
     @staticmethod
     def from_dataset(
@@ -51,7 +51,7 @@ class PixelPool:
         most: int,
         seed: int,
     ) -> PixelPool:
-        """Reads some training images once; masked pixels are left out.
+        """The pool of some training images, which are read once, without masked pixels.
 
         Of more than ``most`` pixels, unless that is 0, a random subset is read, the same fraction of each image. Raises
         InputError naming an image or mask that cannot be used, or if the masks leave nothing.
@@ -88,7 +88,7 @@ class PixelPool:
 
     @cached_property
     def count(self) -> int:
-        """Number of pixels that are drawn from; asked of the device once, not in every step."""
+        """Number of pixels in the pool; read from the device once, not in every step."""
         return int((self.ends - self.begins).sum())
 
     def draw(
@@ -128,9 +128,9 @@ def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[U
 def rays_to_keypoints(
     observations: Observations, device: str | torch.device, images: Sequence[int]
 ) -> TrainingRays | None:
-    """Rays from some training cameras to the SfM points that they saw; None if there are none.
+    """Rays from some training cameras to the SfM points that they see; None if there are none.
 
-    A ray goes to the point itself, a fraction of a pixel from the keypoint, so no lens model is needed.
+    A ray ends at the point itself, a fraction of a pixel from the keypoint, so no lens model is needed.
     """
     cameras, points = observations.tracked
     chosen = np.isin(cameras, images)
@@ -154,7 +154,7 @@ class RaySources:
     keypoints: TrainingRays | None
     """By ``rays_to_keypoints``."""
     rays: Rays
-    """Makes rays through pixel centres (image, row, column)."""
+    """Generator of rays through pixel centres (image, row, column)."""
     new_view_share: float
     """Rays of new views for each pixel ray."""
     keypoint_rays: int
@@ -162,7 +162,7 @@ class RaySources:
     no_new_views: str
     """Reason why there are no new views, if there are none."""
     exposures: Float[Tensor, "M 3"] | None = None
-    """Colours of each training image over those of the field; None if all have the same exposure."""
+    """Colour in each training image over colour in the field; None if all have the same exposure."""
 
     def of_images(self, images: NDArray[np.int64]) -> RaySources:
         """The sources of some images. Raises InputError if masks leave them no pixel."""
@@ -205,7 +205,7 @@ class RaySources:
     def draw(
         self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
     ) -> tuple[TrainingRays, dict[str, Tensor]]:
-        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and what images say of them.
+        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and their batch.
 
         Returns:
             The rays. The batch: ``image``, colours of the rays of pixels and new views, at the exposure of the field

@@ -24,13 +24,14 @@ from torch import Tensor
 from mmpi_ns.scene.geometry import rotate
 
 Rays = Callable[[Int[Tensor, "R 3"]], RayBundle]
-"""Makes rays through pixel centres (camera, row, column)."""
+"""Generator of rays through pixel centres (camera, row, column)."""
 MOST_DIRECTIONS = 20_000_000
-"""Pixels of several lenses for which directions are kept (12 bytes each); nerfstudio makes the rays of more."""
+"""Maximum number of pixels of several lenses whose directions are stored (12 bytes each); beyond it nerfstudio
+generates the rays."""
 UNDISTORTED = 2**16
-"""Pixels that are undistorted at once: their intermediate numbers fit the caches of a CPU."""
+"""Pixels undistorted at once: their intermediate values fit the caches of a CPU."""
 CHUNK = 2**18
-"""Pixels whose rays are made at once."""
+"""Pixels whose rays are generated at once."""
 GRID = 17
 """Grid points along each side of an image, for placement."""
 BENT = (CameraType.FISHEYE, CameraType.FISHEYE624, CameraType.EQUIRECTANGULAR)
@@ -39,12 +40,12 @@ BENT = (CameraType.FISHEYE, CameraType.FISHEYE624, CameraType.EQUIRECTANGULAR)
 
 @dataclass
 class TrainingRays(RayBundle):
-    """Rays of a training step, with what the capture tells of each. Fields are None where it tells nothing of any."""
+    """Rays of a training step with their priors; a field is None if no ray has that prior."""
 
     keypoint_disparities: Float[Tensor, "*batch 1"] | None = None
     """Inverse distance of the SfM point on a keypoint ray, 0 on other rays."""
     disparities: Float[Tensor, "*batch 2"] | None = None
-    """Inverse distance of the content of a pixel and its expected error, 0 where unknown."""
+    """Inverse distance of a pixel's surface and its expected error, 0 where there is none."""
     exposures: Float[Tensor, "*batch 3"] | None = None
     """Colour in the ray's image over colour in the field."""
     through_pixel: Bool[Tensor, "*batch 1"] | None = None
@@ -53,7 +54,7 @@ class TrainingRays(RayBundle):
 
 @dataclass(frozen=True)
 class CameraRays:
-    """Takes the place of nerfstudio's ``RayGenerator`` for N perspective and fisheye cameras."""
+    """Replacement of nerfstudio's ``RayGenerator`` for N perspective and fisheye cameras."""
 
     poses: Float[Tensor, "N 3 4"]
     focal: Float[Tensor, "N 2"]
@@ -165,6 +166,6 @@ def lens_directions(cameras: Cameras) -> NDArray[np.float64] | None:
 
 
 def _without_nan(directions: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
-    """Local directions with the middle of a fisheye straight ahead, where nerfstudio divides by 0."""
+    """Local directions with the centre of a fisheye straight ahead, where nerfstudio divides by 0."""
     finite = torch.isfinite(directions).all(-1, keepdim=True)
     return torch.where(finite, directions, directions.new_tensor([0.0, 0.0, -1.0]))

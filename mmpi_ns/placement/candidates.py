@@ -1,8 +1,8 @@
 """Candidates for MPIs: a generous list, from which ``rule.py`` chooses.
 
 They are frusta of training cameras, some pulled back, some widened: seen from its own origin an MPI has no plane error
-and texels as fine as pixels. (MPIs that face left, right, up or down at a camera, and cubes around what cameras look at
-from all round, were candidates too, and measured worse.)
+and texels as fine as pixels. (MPIs that face sideways, up or down at a camera, and cubes around objects, measured
+worse.)
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ MAX_VIEWS, MAX_WIDE_VIEWS = 96, 32
 FACES = ("front", "left", "right", "above", "below", "back")
 """Facing directions of MPIs at a wide camera; each covers the directions nearest to it, with a margin."""
 BESIDE = 0.9
-"""Part of its largest component that a direction has along a face that holds it."""
+"""Minimum component of a direction along a face that contains it, relative to its largest component."""
 MARGINS = (1.12, 1.4, 1.75)
 """Frusta of views, relative to the camera's own."""
 PULL_BACKS = (0.0, 1.0, 2.0)
-"""Distances of an MPI behind its camera, relative to where points start."""
+"""Distances of an MPI behind its camera, relative to the depth at which points start."""
 NEAR_SHARE = 0.6
-"""First plane, relative to where points start."""
+"""Depth of the first plane, relative to that at which points start."""
 
 
 def vector(v: Array) -> Vector:
@@ -58,7 +58,7 @@ class Candidate:
     frame: MPIPlan
     """Pose and extent; its planes and texels are not set yet."""
     rows: float
-    """Rows if a texel spans one pixel, seen from where the MPI stands."""
+    """Rows if a texel spans one pixel, seen from the MPI's origin."""
     columns: float
     plane: NDArray[np.float32]
     """[Q] e_p of each observation with two planes, in pixels: with L planes it is plane / (L - 1)."""
@@ -103,8 +103,8 @@ def find_candidates(observations: Observations, visible: VisiblePoints) -> list[
 
 
 def _faces(observations: Observations, i: int) -> Iterator[tuple[str, Array, Array, Array]]:
-    """Of each facing direction for MPIs at a camera, its own, and for a wide lens also its sides: name, axes (rows
-    right, down, facing), and the smallest and largest tangents that the camera sees to the right and downwards."""
+    """Facing directions of MPIs at a camera: its own, and for a wide lens also its sides. For each the name, axes (rows
+    right, down, facing), and smallest and largest tangents that the camera sees to the right and downwards."""
     right, up, back = observations.camera_to_worlds[i, :, :3].T
     axes, name = np.stack([right, -up, -back]), f"view {i + 1}"
     if observations.lens is None:

@@ -2,7 +2,7 @@
 
 A point between two planes is represented on one of them, with an error of up to half a spacing in disparity; for a
 camera away from the MPI's origin that is a shift in the image. A texel seen from closer than the MPI's origin spans
-several pixels. Formulas for a camera parallel to the MPI are in docs/how_it_works.md; here the projection is
+several pixels. Formulas for a camera parallel to the MPI are in docs/placement.md; here the projection is
 differentiated instead, which holds for any pose.
 """
 
@@ -17,7 +17,7 @@ from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 WORST = 64.0
-"""Error in pixels of an observation that no head contains, and upper bound on all errors."""
+"""Error of an observation that no head contains, and upper bound on all errors, pixels."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PixelErrors:
 
     @property
     def combined(self) -> Array:
-        """[Q, K] both combined: a sample is displaced by at most e_p and half a texel."""
+        """[Q, K] hypot of e_p and half of e_t: a sample is displaced by at most e_p and half a texel."""
         return np.hypot(self.plane, 0.5 * self.texel)
 
 

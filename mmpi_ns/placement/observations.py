@@ -1,5 +1,5 @@
-"""Input of placement: training cameras, SfM points and their keypoints, and what of it placement weighs: robust to
-outliers, and independent of any order. Plain float64 NumPy."""
+"""Input of placement: training cameras, SfM points and their keypoints, and the weighted observations made from them:
+robust to outliers and independent of any order. Plain float64 NumPy."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ WIDE = 1.5
 """Tangent beyond which a lens that compresses its borders counts as wide: planes facing like the camera cover too
 little of its field of view."""
 SQUEEZED = 1.3
-"""Such a lens sees farther than a pinhole of its focal length would, by this factor in tangents."""
+"""Factor in tangents by which such a lens sees farther than a pinhole of its focal length."""
 BEYOND_LENS = 0.05
-"""Cosines by which a keypoint may lie beyond the borders of its lens."""
+"""Margin, as a cosine, by which a keypoint may lie beyond the borders of its lens."""
 FILLING = 24
-"""Points that fill the frustum of a camera."""
+"""Number of points that fill the frustum of a camera."""
 SAMPLED, SAMPLED_PER_CAMERA = 6000, 16
 """Minimum number of observations that the choice is based on, in all and for each camera, if there are as many."""
 FRUSTUM_SHARE, FEW = 0.15, 10
 """Weight, in every image, of points that fill its frustum: a share, and most of it with FEW keypoints or less. An
 image without keypoints (sky, a white wall) needs planes too."""
 SPAN = (0.25, 0.9)
-"""Quantiles of depth between which the points of an image are said to lie."""
+"""Quantiles that bound the depths of an image's points."""
 COVERED, LEAST_COVERED = 3000, 0.25
-"""Points whose images are counted, and the share of them that fewer pixels than stated may see."""
+"""Number of points for which images are counted, and share of them that may be seen by fewer pixels than the result."""
 FACTOR, SUPPORT = 1.5, 0.04
-"""Content starts, for a camera, at the least depth from which a factor of FACTOR holds the share SUPPORT of its
-observations."""
+"""Content starts, for a camera, at the least depth such that depths up to FACTOR times it contain the share SUPPORT of
+its observations."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class Observations:
     seen_point: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """[Q] point of each keypoint."""
     seen_at: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    """[S, 2] pixel (x, y) of the first S <= Q keypoints, those of SfM; the others come from searched surfaces."""
+    """[S, 2] pixel (x, y) of the first S <= Q keypoints, those of SfM; the others come from estimated surfaces."""
     lens: Array | None = None
     """[M, G, G, 3] unit directions, in camera axes, through a grid over each image from border to border, row after
     row; None if all cameras are pinholes."""
     loose: Array | None = None
-    """[L, 3] points of a cloud that does not record which images saw them (``mmpi_priors/clouds.py`` finds out)."""
+    """[L, 3] points of a cloud without visibility (``mmpi_priors/clouds.py`` determines it)."""
 
     @property
     def centers(self) -> Array:
@@ -66,7 +66,8 @@ class Observations:
 
     @property
     def tracked(self) -> tuple[NDArray[np.int64], Array]:
-        """Camera [S] and point [S, 3] of each keypoint of SfM; those of searched surfaces are too rough for depths."""
+        """Camera [S] and point [S, 3] of each keypoint of SfM; those of estimated surfaces are too inaccurate for
+        depths."""
         count = len(self.seen_at)
         return self.seen_by[:count], self.points[self.seen_point[:count]]
 
@@ -95,7 +96,7 @@ class Observations:
 
     @cached_property
     def wide(self) -> NDArray[np.bool_]:
-        """[M] which cameras see farther to the sides than planes in front of them can cover."""
+        """[M] mask of the cameras that see farther to the sides than planes in front of them can cover."""
         if self.lens is None:
             return np.zeros(len(self.centers), dtype=bool)
         ahead = -self.lens[..., 2]
@@ -121,8 +122,8 @@ class Observations:
         return depths
 
     def directions(self, camera: int, shares: Array) -> Array:
-        """Directions [N, 3], in axes of a camera and of depth 1, through places [N, 2] of its image: x and y as shares
-        of the image's sides; a little beyond the borders will do."""
+        """Directions [N, 3], in axes of a camera and of depth 1, through positions [N, 2] in its image: x and y as
+        shares of the image's sides, also slightly beyond the borders."""
         if self.lens is None:
             (fx, fy, cx, cy), (w, h) = self.intrinsics[camera], self.sizes[camera]
             x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
@@ -137,7 +138,8 @@ class Observations:
         return directions / depth[:, None]
 
     def project(self, cameras: NDArray[np.int64], points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Pixels [Q, 2] at which cameras [Q] would see points [Q, 3], lens distortion left out, and which lie ahead."""
+        """Pixels [Q, 2] of points [Q, 3] in cameras [Q], without lens distortion, and mask of the points that lie
+        ahead."""
         poses = self.camera_to_worlds[cameras]
         local = np.einsum("qji,qj->qi", poses[:, :, :3], points - poses[:, :, 3])
         ahead = local[:, 2] < 0
@@ -148,27 +150,27 @@ class Observations:
 
 @dataclass(frozen=True)
 class VisiblePoints:
-    """The points that placement weighs, and the cameras that see them."""
+    """Weighted observations of placement: points, and the cameras that see them."""
 
     cameras: NDArray[np.int64]
     """[Q] camera of each observation."""
     points: Array
-    """[Q, 3] what it observes."""
+    """[Q, 3] observed point."""
     weights: Array
-    """[Q] what an observation counts; those of a camera sum to 1."""
+    """[Q] weight of each observation; those of a camera sum to 1."""
     nearest: Array
     """[M] depth, along each camera's axis, at which its points start."""
     typical: Array
-    """[M, 2] depths before which a quarter and nine tenths of each camera's points lie."""
+    """[M, 2] depths below which a quarter and nine tenths of each camera's points lie."""
     near: float
-    """Depth at which points start for the cameras in general."""
+    """Depth at which points start, over all cameras."""
 
 
 def find_visible_points(observations: Observations) -> VisiblePoints:
-    """The observations that placement weighs: keypoints, and points that fill the cameras' frusta.
+    """Weighted observations: keypoints, and points that fill the cameras' frusta.
 
-    Keypoints that are not finite or lie behind their camera are left out. Without any the nearest point is taken to lie
-    at a tenth of the cameras' spread. Raises InputError if there are keypoints, and none of them can be used.
+    Keypoints that are not finite or lie behind their camera are dropped. Without any, content is assumed to start at a
+    tenth of the cameras' spread. Raises InputError if there are keypoints, and none of them can be used.
     """
     centers = observations.centers
     cameras, points = observations.seen_by, observations.points[observations.seen_point]
@@ -187,7 +189,7 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     typical = np.tile(np.quantile(depth, SPAN), (len(centers), 1))
     for i in starts:
         typical[i] = np.quantile(depth[cameras == i], SPAN)
-    # Evenly spaced in an order that no numbering, pose or unit enters: by depth.
+    # Evenly spaced in order of depth, which does not depend on numbering, pose or unit.
     order = np.argsort(observations.depths(cameras, points) / near, kind="stable")
     sampled = min(len(order), max(SAMPLED, SAMPLED_PER_CAMERA * len(centers)))
     keep = order[np.linspace(0, len(order) - 1, sampled).round().astype(int)]
@@ -212,10 +214,10 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
 
 
 def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> float:
-    """Training pixels that fall, in all images together, on what one pixel of an image shows; at least 1.
+    """Number of training pixels, in all images together, that see the surface of one pixel; at least 1.
 
-    An image counts by the square of its magnification relative to the observing one. Three quarters of what the
-    cameras see are covered by at least this many pixels. Occlusion is not considered.
+    An image counts by the square of its magnification relative to the observing one. Three quarters of the visible
+    points are seen by at least this many pixels. Occlusion is not considered.
     """
     some = np.linspace(0, len(visible.cameras) - 1, min(COVERED, len(visible.cameras))).round().astype(int)
     cameras, points, weights = visible.cameras[some], visible.points[some], visible.weights[some]
@@ -237,8 +239,8 @@ def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> floa
 def farthest_first(places: Array, count: int | None = None, radius: float = 0.0) -> list[int]:
     """Places far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
 
-    Starts at the place farthest from the middle, so the numbering does not matter. Without a count, as many of the
-    places [M, D] as it takes until balls of ``radius`` around them contain all.
+    Starts at the place farthest from the centre, so the numbering does not matter. Without a count, as many of the
+    places [M, D] as needed for balls of ``radius`` around them to contain all.
     """
     chosen = [int(np.linalg.norm(places - places.mean(0), axis=-1).argmax())]
     distance = np.linalg.norm(places - places[chosen[0]], axis=-1)
@@ -249,7 +251,7 @@ def farthest_first(places: Array, count: int | None = None, radius: float = 0.0)
 
 
 def _start(depth: Array) -> float:
-    """The least depth from which on a factor of FACTOR holds SUPPORT of all: a lone outlier in front does not count."""
+    """Depth at which content starts (``FACTOR``, ``SUPPORT``); a lone outlier in front does not count."""
     ordered = np.sort(depth)
     inside = np.searchsorted(ordered, ordered * FACTOR, side="right") - np.arange(len(ordered))
     return float(ordered[np.argmax(inside >= max(1.0, SUPPORT * len(ordered)))])

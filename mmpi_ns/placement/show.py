@@ -1,4 +1,4 @@
-"""What a plan does for a scene: the table that ``mmpi-plan`` prints, and pictures of plan, windows and errors."""
+"""Report of a plan: the table that ``mmpi-plan`` prints, and pictures of plan, windows and errors."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ SHOWN_PLANES = 12
 
 @dataclass(frozen=True)
 class PlanReport:
-    """Shares and expected errors of the K heads of a plan (MPIs, then the cube), over what placement weighs."""
+    """Shares and expected errors of the K heads of a plan (MPIs, then the cube), over the weighted observations."""
 
     shares: Array
     """[K] share of the observations that a head serves best."""
     error_with: Array
     """[K] expected error of those, median in pixels."""
     error_without: Array
-    """[K] the same if the head were left out."""
+    """[K] the same without the head."""
     unserved: float
-    """Share of the observations that nothing holds."""
+    """Share of the observations that no head contains."""
     overlap: float
-    """Heads that hold an observation, on average."""
+    """Mean number of heads that contain an observation."""
     best: NDArray[np.int64]
     """[Q] head that serves each observation best,"""
     served_errors: Array
-    """[Q] and its expected pixel error there; ``WORST`` where none holds it."""
+    """[Q] and its expected pixel error there; ``WORST`` where none contains it."""
 
 
 def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints) -> PlanReport:
-    """Shares and expected errors of every head, over the observations that placement weighs."""
+    """Shares and expected errors of every head, over the weighted observations."""
     errors = pixel_errors(plan, observations, visible.cameras, visible.points).combined
     combined, weights = np.minimum(errors, WORST), visible.weights / visible.weights.sum()
     held, best, figures = np.isfinite(errors), errors.argmin(-1), np.full((3, plan.num_heads), np.nan)
@@ -90,7 +90,7 @@ def table(plan: ScenePlan, observations: Observations, report: PlanReport) -> st
 
 
 def describe_facing(direction: Array, base: Array) -> str:
-    """Which way a direction points in a frame of rows right, down, forward: the nearest of six, and degrees off it."""
+    """Name of a direction in a frame of rows right, down, forward: the nearest of six, and degrees off it."""
     names = ("right", "below", "front", "left", "above", "back")
     along = np.concatenate([base @ direction, -(base @ direction)])
     nearest = int(along.argmax())
@@ -105,7 +105,7 @@ def draw_plan(path: Path, plan: ScenePlan, observations: Observations, visible: 
     """
     base = observations.mean_axes * np.array([[1.0], [-1.0], [1.0]])  # right, up, forward
     middle = observations.centers.mean(0)
-    # The far ones would shrink everything else to a dot.
+    # Far planes are left out: they would shrink everything else to a dot.
     distance = np.linalg.norm(visible.points - observations.centers[visible.cameras], axis=-1)
     points = visible.points[distance < 40 * visible.near]
     points = (points[:: max(1, len(points) // SHOWN_POINTS)] - middle) @ base.T
@@ -141,7 +141,7 @@ def draw_plan(path: Path, plan: ScenePlan, observations: Observations, visible: 
 
 
 def draw_windows(path: Path, windows: WindowedPlan, observations: Observations) -> None:
-    """Writes a map (PNG) of a long capture: cameras, windows with their margins, and where MPIs stand and look."""
+    """Writes a map (PNG) of a long capture: cameras, windows with their margins, origins and directions of MPIs."""
     base = observations.mean_axes
     map_axes = np.stack([base[2], -base[0]])  # forward to the right, left up
     middle = observations.centers.mean(0)

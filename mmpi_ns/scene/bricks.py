@@ -1,4 +1,4 @@
-"""Tables of bricks as a whole: allocating, filling, growing and compacting them. Row arithmetic is in ``texels.py``."""
+"""Allocation, filling, growth and compaction of tables of bricks. Row arithmetic is in ``texels.py``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mmpi_ns.utils.pages import FORGET, advise, all_zero, empty_table, lazy_zero
 CHUNK = 1 << 17
 """Texels of an MPI that are resampled at once: for nine channels this takes some 40 MB besides both tables."""
 AT_ONCE = 1 << 23
-"""Bytes of the bricks that move at once."""
+"""Bytes of bricks that are moved at once."""
 
 
 def new_table(tiles: Int[Tensor, "T"], channels: int, empty: float = 0.0, dtype=torch.float32) -> Float[Tensor, "N C"]:
@@ -28,7 +28,7 @@ def new_table(tiles: Int[Tensor, "T"], channels: int, empty: float = 0.0, dtype=
 
 
 def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, images: Float[Tensor, "P H W C"]) -> None:
-    """Stores images in the existing bricks; texels of other tiles are left out."""
+    """Writes images into the existing bricks; texels of other tiles are skipped."""
     tiles = grid.own_tiles[planes]
     stored = tiles > 0
     below, right = grid.down * SIDE - grid.height, grid.across * SIDE - grid.width
@@ -38,8 +38,8 @@ def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, im
 
 
 def move_bricks(table: Shaped[Tensor, "N ..."], kept: Int[Tensor, "K"]) -> Shaped[Tensor, "M ..."]:
-    """The bricks ``kept``, in ascending order, of a table or its moments, which is lost: memory of bricks that were
-    passed is given back, so that there is never more of it than for one table and a few bricks."""
+    """The bricks ``kept``, in ascending order, of a table or its moments, which is consumed: memory of copied bricks is
+    freed, so that the peak is one table and a few bricks."""
     bricks, shape = table.view(-1, BRICK, *table.shape[1:]), (len(kept) * BRICK, *table.shape[1:])
     if all_zero(table):
         return lazy_zeros(shape, table.dtype, table.device)
@@ -66,7 +66,7 @@ def grown_tiles(
         old: current heads.
         new: heads at the new resolution; their tiles are not read.
         reachable: tiles that training rays cross; None for all.
-        least: share of stored texels in an interpolated one from which (0: above which) it is stored.
+        least: minimum weight of stored texels in an interpolated one for it to be stored (0: any).
     """
     stored = torch.zeros_like(new[0].tiles, dtype=torch.bool)
     for source, target in zip(old, new, strict=True):
@@ -83,10 +83,10 @@ def grown_tiles(
 def tiles_with_copies(
     grids: list[TexelGrid], copies: list[TexelGrid], chosen: Bool[Tensor, "T"]
 ) -> tuple[Bool[Tensor, "S"], Bool[Tensor, "T"]]:
-    """Tiles that finer copies of MPIs store of chosen ones, and those that the MPIs themselves go on storing.
+    """Tiles stored by finer copies of MPIs for chosen ones, and tiles that the MPIs continue to store.
 
-    A chosen tile has FINER x FINER tiles in the copy. The MPI gives it up where all stored tiles around it are chosen
-    too, so copy and MPI overlap by a tile and no seam is seen.
+    A chosen tile has FINER x FINER tiles in the copy. The MPI drops it if all stored tiles around it are chosen too, so
+    copy and MPI overlap by a tile without a visible seam.
 
     Args:
         grids: all heads, MPIs first.
@@ -139,7 +139,7 @@ def resample(
 
 
 def _chunks(target: TexelGrid) -> Iterator[tuple[slice, slice]]:
-    """A few planes at a time: where they come from and where they go. The cube's layers go together."""
+    """Source and target planes, a few at a time. The cube's layers go together."""
     step = target.depth if target.is_cube else max(1, CHUNK // (target.height * target.width))
     for start in range(0, target.depth, step):
         planes = slice(start, min(start + step, target.depth))
@@ -147,7 +147,7 @@ def _chunks(target: TexelGrid) -> Iterator[tuple[slice, slice]]:
 
 
 def stored_texels(grid: TexelGrid, planes: slice) -> Bool[Tensor, "P h w 1"]:
-    """Which texels of some planes are stored."""
+    """Mask of the stored texels of some planes."""
     wide = (grid.own_tiles[planes] > 0).repeat_interleave(SIDE, 1).repeat_interleave(SIDE, 2)
     return wide[:, : grid.height, : grid.width, None]
 

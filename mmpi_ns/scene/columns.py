@@ -1,4 +1,4 @@
-"""Columns: which of ``WORD`` consecutive planes of a tile are occupied, as bits, so that a ray skips the others."""
+"""Columns: bits of the occupied ones of ``WORD`` consecutive planes of a tile, so that a ray skips the others."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Te
     """Columns of one MPI, and (plane, row, column) of its bricks in their order.
 
     Args:
-        stored: bool [planes, down, across], which tiles are occupied.
-        first: bricks of the MPIs before.
+        stored: bool [planes, down, across], mask of the occupied tiles.
+        first: number of bricks of earlier MPIs.
     """
     planes, down, across = stored.shape
     padded = torch.nn.functional.pad(stored, (0, 0, 0, 0, 0, -planes % WORD))

@@ -16,7 +16,7 @@ from torch import Tensor
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 FACING_EPS = 1e-6
-"""A ray with a smaller facing component (cosine) is parallel to the planes and hits none of them."""
+"""Cosine below which a ray counts as parallel to the planes and intersects none of them."""
 
 
 @dataclass(frozen=True)
@@ -51,16 +51,16 @@ class Frames:
 
 @dataclass(frozen=True)
 class PlaneHits:
-    """Crossings of R rays with the planes of K MPIs.
+    """Intersections of R rays with the planes of K MPIs.
 
-    Planes are counted by m = L - 1 - l, so m = 0 is the last one and the disparity is w = 1/far + m * step.
-    The live planes of a ray are m_first, m_first - 1, ..., ``count`` of them, near to far.
+    Planes are counted by m = L - 1 - l, so m = 0 is the last one and the disparity is w = 1/far + m * step. The planes
+    that a ray intersects are m_first, m_first - 1, ..., ``count`` of them, near to far.
     """
 
     m_first: Int[Tensor, "R K"]
-    """m of the nearest live plane."""
+    """m of the nearest intersected plane."""
     count: Int[Tensor, "R K"]
-    """Number of live planes; 0 if the ray meets none."""
+    """Number of intersected planes."""
     u: Float[Tensor, "R K 2"]
     """u(w) = u[0] + w u[1], tangent along the frame's x."""
     v: Float[Tensor, "R K 2"]
@@ -97,10 +97,10 @@ def plane_hits(
     fars: Float[Tensor, "R 1"],
     frames: Frames,
 ) -> PlaneHits:
-    """The live planes of each ray in each MPI, in closed form.
+    """The planes that each ray intersects in each MPI, in closed form.
 
-    A plane is live if it faces the ray, lies ahead of the camera, between near and far, and is crossed inside
-    the MPI's extent. Each condition is a half-space p w <= q in disparity, so the live planes are one range.
+    A plane counts if it faces the ray, lies ahead of the camera, between near and far, and is intersected inside the
+    MPI's extent. Each condition is a half-space p w <= q in disparity, so these planes are one range.
 
     Args:
         origins: ray origins, world axes, scene units.
@@ -110,7 +110,7 @@ def plane_hits(
         frames: the K MPI frames.
 
     Returns:
-        The live range of every ray in every MPI and the affine maps from disparity to (u, v).
+        The range of planes of every ray in every MPI, and the affine maps from disparity to (u, v).
 
     Source: paper, sec. III-B ("sample and merge", forward-facing check); docs/how_it_works.md, "Intersected planes".
     """

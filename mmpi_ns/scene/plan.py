@@ -20,7 +20,7 @@ SHALLOWEST = 1.001
 """Minimum ratio of the depths of an MPI's last and first plane: float32 could not distinguish closer ones."""
 
 HUGE = 1e18
-"""Longest length of a plan, scene units: float32 still holds its square."""
+"""Maximum length in a plan, scene units: float32 can represent its square."""
 LENGTH = Number(-HUGE, HUGE)
 WIDEST = 1e6
 """Largest tangent of a frustum."""
@@ -29,8 +29,8 @@ MOST_PLANES, MOST_TEXELS, MOST_VOXELS, MOST_DETAIL = 4096, 16384, 4096, 64
 FINER = 2
 """Cells of a finer copy along each side of a cell of its MPI."""
 WORTH_COPIES = 3.0
-"""Multiple of the texels in use that rays could train from which MPIs get finer copies: four times as many texels of
-some bricks are a few too many for them, but those bricks have more rays than others."""
+"""Ratio of trainable texels to texels in use above which MPIs get finer copies: four times the texels of some bricks
+are slightly too many, but those bricks have more rays than others."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class MPIPlan:
     near: float
     """Depth of the nearest plane; the planes are evenly spaced in disparity from there to ``far``."""
     extent: tuple[float, float, float, float]
-    """Frustum as tangents (u0, u1, v0, v1); asymmetric is fine."""
+    """Frustum as tangents (u0, u1, v0, v1); may be asymmetric."""
     planes: int
     """Number of planes, the last one at ``far``."""
     height: int
@@ -98,11 +98,11 @@ class ScenePlan:
     origin_of_plan: str = "by hand"
     """The rule that made the plan, for information."""
     detail: float = 1.0
-    """Largest multiple of the texels that training may use: where released bricks leave room it makes planes finer, and
-    of what shows errors finer copies."""
+    """Maximum texels that training may use, as a multiple of the plan's: in the room of released bricks it refines
+    planes and copies bricks with large errors at a finer resolution."""
 
     def __post_init__(self) -> None:
-        """Raises InputError with one sentence that names the MPI and the field that cannot be used."""
+        """Check of all fields. Raises InputError that names the MPI and the unusable field."""
         if not self.mpis:
             raise InputError("A scene plan needs at least one MPI, this one has none: add one to its list 'mpis'.")
         for number, mpi in enumerate(self.mpis):
@@ -166,7 +166,7 @@ class ScenePlan:
 
     @property
     def farthest(self) -> float:
-        """Depth that stands for infinity in images: ten times that of the last plane that is not there."""
+        """Depth that stands for infinity in images: ten times that of the farthest finite plane."""
         return 10 * max(m.near * (m.planes - 1) if m.far == math.inf else m.far for m in self.mpis)
 
     def scaled(self, factor: float) -> ScenePlan:
@@ -182,7 +182,7 @@ class ScenePlan:
 
     def with_copies(self) -> ScenePlan:
         """The plan with a copy of each MPI, in the same order before all MPIs: equal frame and planes, FINER times as
-        many cells along each side. At equal distances a copy hides what it replaces."""
+        many cells along each side. At equal distances a copy comes first."""
         copies = (
             replace(m, name=f"{m.name}, finer", height=FINER * (m.height - 1) + 1, width=FINER * (m.width - 1) + 1)
             for m in self.mpis
@@ -190,8 +190,8 @@ class ScenePlan:
         return replace(self, mpis=(*copies, *self.mpis))
 
     def may_be_copied(self, factor: float = 1.0) -> bool:
-        """Whether rays could train finer copies of planes that have ``factor`` times the planned texels, and plans of
-        that size are allowed."""
+        """Whether the rays suffice to train finer copies of planes with ``factor`` times the planned texels, and plans
+        of that size are allowed."""
         longest = max(side for m in self.scaled(factor).mpis for side in (m.height, m.width))
         return self.detail >= WORTH_COPIES * factor and FINER * longest <= MOST_TEXELS
 
@@ -259,7 +259,7 @@ def check_fields(cls: type, data: Any, where: str) -> None:
 
 
 def _tuples(value: Any) -> Any:
-    """A JSON value with tuples for its lists."""
+    """A JSON value with tuples in place of lists."""
     if isinstance(value, dict):
         return {name: _tuples(v) for name, v in value.items()}
     return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

@@ -1,4 +1,4 @@
-"""Which texels a lookup reads, and with which weights. Pure index arithmetic over one pooled table.
+"""Texel rows and interpolation weights of lookups: index arithmetic over one pooled table.
 
 Density, features and reliability each have one table, shared by all heads. A table is a list of bricks of ``BRICK``
 rows, the ``SIDE`` x ``SIDE`` texels of one tile of a plane (row by row). ``tiles`` maps tiles to bricks: head by head,
@@ -87,7 +87,7 @@ class TexelGrid:
         return self.row(z, y, x)
 
     def holds(self, rows: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Which rows belong to this head; those of the empty brick belong to none."""
+        """Mask of the rows of this head; those of the empty brick belong to none."""
         place = self.places[rows >> 6]
         return (place >= self.first_tile) & (place < self.first_tile + self.own_tiles.numel())
 
@@ -134,7 +134,7 @@ def head_shapes(plan: ScenePlan) -> list[tuple[int, int, int]]:
 def make_grids(
     shapes: list[tuple[int, int, int]], tiles: Int[Tensor, "T"] | None = None, with_cube: bool = False
 ) -> list[TexelGrid]:
-    """Grids of these sizes, stored one after the other; ``with_cube``: the last one is the cube."""
+    """Grids of these sizes, one after the other; ``with_cube``: the last one is the cube."""
     sides = [(-(-height // SIDE), -(-width // SIDE)) for _, height, width in shapes]
     counts = [depth * math.prod(side) for (depth, _, _), side in zip(shapes, sides, strict=True)]
     if tiles is None:
@@ -150,5 +150,5 @@ def make_grids(
 
 
 def number_tiles(stored: Bool[Tensor, "T"]) -> Int[Tensor, "T"]:
-    """``tiles`` in which the chosen tiles have a brick each."""
+    """``tiles`` with a brick for each chosen tile."""
     return torch.where(stored, stored.cumsum(0), 0).to(torch.int32)

@@ -16,17 +16,17 @@ from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.texels import SIDE
 
 BORDER_RAYS = 33
-"""Rays along each border of an image, enough to follow lens distortion."""
+"""Number of rays along each border of an image, enough for lens distortion."""
 MARGIN = 0.25
 """Texels added on each side of a tile: rays are drawn in float32."""
 AT_ONCE = 8
-"""Cameras that are compared with all tiles that none of the earlier ones can read."""
+"""Number of cameras that are compared together with the tiles that no earlier one can read."""
 PART = 1 << 14
-"""Tiles that are looked at together."""
+"""Number of tiles processed together."""
 REMEMBERED = 128
-"""Plans and cameras whose tiles are remembered, a bit each; the windows of a long capture have a plan each."""
+"""Number of cached results, a bit per tile; the windows of a long capture have a plan each."""
 _remembered: dict[tuple[bytes, ScenePlan], tuple[NDArray[np.uint8], int]] = {}
-"""Marks of all tiles, eight in a byte, and their number, the most recently used last."""
+"""Cached masks of tiles, eight per byte, and number of tiles, the most recently used last."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class TrainingViews:
 def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.device = "cpu") -> Bool[Tensor, "T"]:
     """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read.
 
-    A tile is left out if it lies outside one of the four planes of every image, or on a plane that no camera is in
-    front of. This is conservative: a few too many are marked at the corners of images. All tiles of the cube are
-    marked. Computed once for each plan and remembered.
+    A tile is excluded if it lies outside one of the four side planes of every frustum, or on a plane that no camera is
+    in front of. This is conservative: a few too many are marked at the corners of images. All tiles of the cube are
+    marked. Cached for each plan and set of cameras.
 
     Args:
         views: the training images.
@@ -98,7 +98,7 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[
 
     From a camera at o (in the MPI's axes) the point with tangents (u, v) on the plane of disparity w lies in direction
     (u, v, 1) - w o, affine in u and v: over a tile, the maximum of normal . direction is a sum of two maxima. Cameras
-    far from each other come first, and each group is compared with the tiles alone that none has reached.
+    far from each other come first, and each group is compared only with the tiles that none has reached.
     """
     axes = torch.tensor(mpi.axes, dtype=torch.float64)
     spread = torch.cat([torch.arange(len(views.origins))[i::AT_ONCE] for i in range(AT_ONCE)])
@@ -115,7 +115,7 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[
     shift, ahead = (normals * origins[:, None]).sum(-1), normals[..., 2]
     w = 1 / mpi.far + torch.arange(mpi.planes - 1, -1, -1, dtype=torch.float64) * mpi.disparity_step
     rest = ahead - w[:, None, None] * shift
-    rest[w[:, None] * origins[:, 2] >= 1] = -torch.inf  # cameras that a plane lies behind
+    rest[w[:, None] * origins[:, 2] >= 1] = -torch.inf  # cameras behind which a plane lies
     rest = rest.to(device)
     rows, columns = along_y.shape[-1], along_x.shape[-1]
     reachable = torch.zeros(mpi.planes, rows, columns, dtype=torch.bool, device=device)

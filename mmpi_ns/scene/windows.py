@@ -1,4 +1,4 @@
-"""Windows: parts of a long capture, each with its own MPIs, which render only rays that start there.
+"""Windows: parts of a long capture, each with its own MPIs, which render only the rays that start there.
 
 The camera position of a ray determines its windows. Where balls of cameras overlap, the renderings are mixed, with
 shares that change continuously along the path, so no seam is visible (Block-NeRF, Tancik et al. 2022, also mixes by
@@ -24,12 +24,12 @@ from mmpi_ns.utils.values import Number, check_number, check_row
 
 @dataclass(frozen=True)
 class Window:
-    """A ball of cameras, and the plan for what they see."""
+    """A ball of cameras, and its plan."""
 
     center: Vector
-    """Middle of the ball, world axes, scene units."""
+    """Centre of the ball, world axes, scene units."""
     radius: float
-    """Rays of cameras within are rendered by this window; inf (in JSON: null) if there is only one window."""
+    """Radius of the ball, scene units; inf (in JSON: null) if there is only one window."""
     margin: float
     """Beyond the radius, the share of the window falls to zero over this distance."""
     plan: ScenePlan
@@ -60,7 +60,7 @@ class WindowedPlan:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all heads, window after window."""
+        """Names of all heads, window after window."""
         if len(self) == 1:
             return self.plans[0].names
         return tuple(f"window {i}: {name}" for i, plan in enumerate(self.plans) for name in plan.names)
