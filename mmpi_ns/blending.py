@@ -23,11 +23,11 @@ from mmpi_ns.scene.geometry import LocalRays
 def blend_shares(
     reliability: Float[Tensor, "N H"], covers: Bool[Tensor, "N H"], heads: Int[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-    """log P and log(1 - P) of each sample's own head among the heads that cover it.
+    """log P and log(1 - P) of each sample's head among the heads that cover it.
 
     Args:
         reliability: R of every head at the sample's position; values of heads that do not cover it are ignored.
-        covers: which heads cover the position; a sample's own head must be among them.
+        covers: mask of the heads that cover the position; the sample's head must be among them.
         heads: the head that each sample was taken from.
 
     Returns:
@@ -50,7 +50,7 @@ def blend_shares(
     other_values = torch.where(has_others[:, None], other_values, torch.zeros_like(other_values))
     odds = torch.logsumexp(other_values, -1) - own_value
     # With softplus, both logs and both slopes are exact at P near 0 and 1; differences from the sum would cancel there.
-    # From the threshold on torch returns its argument: at the default of 20, float64 could tell them apart.
+    # Above the threshold torch returns its argument; at the default of 20 this would be wrong in float64.
     over, under = (torch.nn.functional.softplus(x, threshold=50) for x in (odds, -odds))
     log_share = torch.where(has_others, -over, torch.zeros_like(odds))
     log_rest = torch.where(has_others, -under, torch.full_like(odds, -torch.inf))
@@ -85,7 +85,7 @@ def log_shares(
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """log P and log(1 - P) of samples among the heads that cover them, with gradients to the reliability.
 
-    A head covers a point in its frustum if the nearest texel was trained; a sample's own head always covers it.
+    A head covers a point in its frustum if the nearest texel was trained; a sample's head always covers it.
 
     Args:
         layout: of the scene.

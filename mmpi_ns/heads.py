@@ -1,7 +1,7 @@
 """The heads of a field: K multi-plane images, and the cube (paper sec. III-A and III-B).
 
-A head is a view of its part of the pooled tables. It says where a point lies in its own NDC, which samples of a ray are
-its own, and what its texels hold there.
+A head is a view of its part of the pooled tables. It maps points to its NDC, samples rays on its planes, and
+interpolates its texels.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Head:
 
     layout: SceneLayout
     number: int
-    """Among the heads of the field; the cube comes last."""
+    """Index among the heads of the field; the cube comes last."""
 
     @property
     def grid(self) -> TexelGrid:
@@ -49,23 +49,24 @@ class Head:
 
         Args:
             density: the pooled table of raw densities.
-            texels: that the samples read.
+            texels: of the samples.
             planes: of the samples; meaningless in the cube.
         """
         return self.layout.optical_depth(self.number, interpolate(density, *texels)[:, 0], planes)
 
     def values(self, table: Float[Tensor, "T C"], ndc: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
-        """What a pooled table (features, reliability) holds at places in the head, between planes too."""
+        """Interpolated values of a pooled table (features, reliability) at positions in the head, also between
+        planes."""
         return interpolate(table, *self.grid.trilinear(ndc))
 
     def covers(self, touched: Tensor, ndc: Float[Tensor, "N 3"], inside: Bool[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Whether the head covers places: inside of it, and the nearest texel was trained (paper sec. III-C)."""
+        """Whether the head covers positions: inside of it, and the nearest texel was trained (paper sec. III-C)."""
         return inside & (touched[self.grid.nearest(ndc)] > 0)
 
 
 @dataclass(frozen=True)
 class MPIHead(Head):
-    """A multi-plane image: planes of equal spacing in disparity in the frustum of its own frame."""
+    """A multi-plane image: planes evenly spaced in disparity in the frustum of its frame."""
 
     @property
     def frame(self) -> Frames:
@@ -104,7 +105,7 @@ class MPIHead(Head):
 
         Args:
             rays: R rays.
-            hits: their crossings with the planes of all MPIs.
+            hits: their intersections with the planes of all MPIs.
             numbers: ray of each sample.
             index: of each sample among those of its ray, near to far.
             first: m of each ray's nearest plane (``PlaneHits``).

@@ -1,4 +1,4 @@
-"""``mmpi-bench gpu``: whether training runs on this machine's GPU as it should, in a minute or some."""
+"""``mmpi-bench gpu``: check of training on this machine's GPU, in a minute or two."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mmpi_ns.utils.machine import processor
 
 DRIVER = Path("/proc/driver/nvidia/version")
 STEPS, RAYS = 20, 1024
-"""Steps that are timed, and rays of each."""
+"""Number of timed steps, and rays of each."""
 
 
 @dataclass
@@ -36,7 +36,7 @@ class Gpu:
     """
 
     folder: Path = Path("outputs/gpu")
-    """Folder for a small capture, its training, and gpu.json with all that was found."""
+    """Folder for a small capture, its training, and gpu.json with all results."""
 
     def main(self) -> None:
         tell = partial(print, flush=True)
@@ -63,7 +63,7 @@ class Gpu:
 
 
 def noise(folder: Path) -> Path:
-    """The folder of a drive past random colours, which is written where it is not there yet: enough to time a step."""
+    """Folder of a drive past random colours, written if it is missing: enough to time a step."""
     if not (folder / "transforms.json").is_file():
         (folder / "images").mkdir(parents=True, exist_ok=True)
         rng, frames, (width, height) = np.random.default_rng(0), [], (155, 47)
@@ -86,7 +86,7 @@ def drive(planes: int, rays: int, *more: str) -> tuple[str, ...]:
 
 
 def environment() -> dict[str, Any]:
-    """What the kernels run on and with."""
+    """Versions and device of the environment."""
     report: dict[str, Any] = {"Python": platform.python_version(), "torch": torch.__version__}
     report["CUDA of torch"] = torch.version.cuda
     for package in ("triton", "nerfstudio", "gsplat", "nerfacc", "tinycudann"):
@@ -102,8 +102,8 @@ def environment() -> dict[str, Any]:
 
 
 def time_training(device: str, data: Path, work: Path) -> dict[str, Any]:
-    """Milliseconds of a step and of a frame of a small capture, and what compiled operations compute otherwise than
-    plain torch."""
+    """Milliseconds of a step and of a frame of a small capture, and differences between compiled operations and plain
+    torch."""
     manager = [f"--pipeline.datamanager.priors.{name}" for name in ("dense-depth", "mask-moving", "correct-exposure")]
     options = (*drive(64, RAYS), *(word for name in manager for word in (name, "False")), *NO_TRACKS)
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():

@@ -32,10 +32,10 @@ Scores = list[tuple[str, dict[str, float]]]
 
 @dataclass
 class Score:
-    """Scores renderings of a scene's test images, whatever made them, as every other table scores its own.
+    """Scores renderings of a scene's test images by any program, with the metrics of all other tables.
 
-    A rendering bears the name of its test image, with any ending: frame_00002.png for images/frame_00002.jpg. Other
-    images in the folder are passed over. All pixels count, masked ones too.
+    A rendering has the name of its test image, with any ending: frame_00002.png for images/frame_00002.jpg. Other
+    images in the folder are ignored. All pixels count, masked ones too.
     """
 
     images: Path
@@ -45,9 +45,9 @@ class Score:
     downscale_factor: int = 1
     """Size of the test images that were rendered."""
     test_images: int = 0
-    """Test images, evenly spaced, that are scored; 0 for all."""
+    """Number of test images to score, evenly spaced; 0 for all."""
     lpips: Literal["vgg", "alex", "none"] = "vgg"
-    """Network of LPIPS; it is left out where the weights are not available."""
+    """Network of LPIPS, which is omitted if the weights are not available."""
 
     def main(self) -> None:
         self.score()

@@ -1,4 +1,5 @@
-"""nerfstudio's trainer in this process: made from the words of an ``ns-train`` line, and driven a step at a time."""
+"""nerfstudio's trainer in this process: made from the arguments of an ``ns-train`` command, and run a step at a
+time."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ import torch
 P = "--pipeline.model.placement."
 JOINT = ("--pipeline.model.schedule.training", "joint")
 NO_TRACKS = ("--pipeline.datamanager.priors.sfm-path", "none", "--pipeline.datamanager.priors.triangulate", "False")
-"""Options of our methods that leave pycolmap out: points are looked for on surfaces (``mmpi_priors/observe.py``)."""
+"""Options of our methods without pycolmap: points are estimated on surfaces (``mmpi_priors/observe.py``)."""
 BARE = () if importlib.util.find_spec("pycolmap") else NO_TRACKS
 """Options of our methods on a machine without pycolmap."""
 
@@ -67,15 +68,14 @@ def trainer_of(config: Any, seed_offset: int = 0) -> Any:
 
 
 def clock() -> float:
-    """Seconds; on a GPU, once it has done all."""
+    """Seconds; on a GPU after synchronisation."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
     return time.perf_counter()
 
 
 class Steps:
-    """The trainer of an ``ns-train`` line a step at a time: what its own loop does in a step, without logging and
-    saving."""
+    """The trainer of an ``ns-train`` command, a step at a time, without logging and saving."""
 
     def __init__(self, words: Sequence[str]) -> None:
         self.trainer = trainer_of(config_of(words))

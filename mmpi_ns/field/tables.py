@@ -1,4 +1,4 @@
-"""The field's tables: one pooled Parameter a kind, in bricks; how they are allocated, grown, released and restored.
+"""The field's tables: one pooled Parameter per kind, in bricks; their allocation, growth, release and restoration.
 
 Parameters stay the same objects whatever their size, so that K, growth and storage never change the parameter list,
 which nerfstudio fixes before K is known. Row arithmetic is in ``texels.py``, work on whole tables in ``bricks.py``.
@@ -29,11 +29,11 @@ RELEASED_DENSITY = -20.0
 EMPTY = {"density": RELEASED_DENSITY, "features": 0.0, "reliability": 0.0}
 """Content of the empty brick in each table."""
 TABLES = tuple(EMPTY)
-"""The parameters that have a row for every texel."""
+"""Names of the parameters with a row for every texel."""
 HALF_LARGEST = 65504.0
 """Largest number of half precision."""
 MIDDLE = 0.5
-"""Share of stored texels in a texel between those and empty ones."""
+"""Minimum weight of stored texels in an interpolated one beside empty texels."""
 ENOUGH_CROSSINGS = 32
 """Average number of training samples for each brick before any brick may be released."""
 
@@ -58,11 +58,11 @@ class Lookup:
     taps: list[Taps]
     """Of the samples of all MPIs together, then of those of the cube; positions are among ``rows``."""
     rows: Int[Tensor, "U"]
-    """Distinct rows of the tables, rising."""
+    """Distinct rows of the tables, ascending."""
     density: Float[Tensor, "U 1"]
     features: Float[Tensor, "U C"]
     distinct: Int[Tensor, ""] | None = None
-    """How many distinct rows there are, where the samples have a capacity."""
+    """Number of distinct rows, where the samples have a capacity."""
 
     def read(self, values: Float[Tensor, "U C"]) -> Float[Tensor, "N C"]:
         """Interpolated values of the samples, from those of the rows."""
@@ -138,10 +138,11 @@ class TexelTables(Field):
         return len(self.density) // BRICK - 1
 
     def cached(self, name: str, make: Callable[[], Any] | None = None) -> Any:
-        """A constant of the plan, made once for the device that the parameters are on; None if nobody makes it."""
+        """A constant of the plan on the device of the parameters, cached; None without ``make``, if it is not
+        cached."""
         key = (name, self.density.device)
         constant = self._packed.get(key)
-        # Where threads make it at once the first one's stays: kernels hold addresses in it, not references.
+        # If several threads make it at once, the first result is used: kernels store addresses, not references.
         return self._packed.setdefault(key, make()) if constant is None and make is not None else constant
 
     def build(
@@ -177,8 +178,8 @@ class TexelTables(Field):
     def tiles_at(self, factor: float) -> Int[Tensor, "T"]:
         """``tiles`` with ``factor`` times the plan's texels, if the tables grew to that now.
 
-        Surfaces have formed when texels become finer than planned: what lies beyond the middle between a stored texel
-        and an empty one stays empty then. Otherwise a rim of tiles would be stored again each time.
+        Surfaces have formed when texels become finer than planned: then, texels beyond the middle between a stored and
+        an empty one stay empty. Otherwise a rim of tiles would be stored again each time.
         """
         plan, least, device = self.full_plan.scaled(factor), MIDDLE if factor > 1 else 0.0, self.density.device
         reached = None if self.views is None else reachable_tiles(self.views, plan, device)
@@ -206,7 +207,7 @@ class TexelTables(Field):
 
     @torch.no_grad()
     def copy_finely(self, chosen: Bool[Tensor, "T"]) -> None:
-        """Puts finer copies of the MPIs before all heads, which hold the chosen tiles (``tiles_with_copies``)."""
+        """Inserts finer copies of the MPIs, with the chosen tiles, before all heads (``tiles_with_copies``)."""
         grids, copies = self.grids, self.copy_grids()
         fine, kept = tiles_with_copies(grids, copies, chosen)
         mpis, copies = grids[: len(copies)], self.copy_grids(number_tiles(fine))
@@ -223,17 +224,17 @@ class TexelTables(Field):
         self.look_afresh()
 
     def copy_grids(self, tiles: Int[Tensor, "S"] | None = None) -> list[TexelGrid]:
-        """Texels of finer copies of the MPIs, of which there are none yet; ``tiles``: None stores all."""
+        """Texels of finer copies of the MPIs, before there are any; ``tiles``: None stores all."""
         mpis = self.plan.with_copies().mpis[: len(self.plan.mpis)]
         return make_grids([(m.planes, m.height, m.width) for m in mpis], tiles)
 
     def planned_heads(self, heads: Tensor) -> Tensor:
-        """Numbers of heads in the plan, where a finer copy has that of its MPI."""
+        """Indices of heads in the plan; a finer copy has that of its MPI."""
         return torch.where(heads >= self.num_copies, heads - self.num_copies, heads)
 
     @property
     def num_copies(self) -> int:
-        """Finer copies, which come before the MPIs."""
+        """Number of finer copies, which come before the MPIs."""
         return len(self.plan.mpis) - len(self.full_plan.mpis)
 
     @torch.no_grad()
@@ -243,7 +244,7 @@ class TexelTables(Field):
         """Records the bricks of the samples of a training batch.
 
         Args:
-            lookup: where the samples read the tables.
+            lookup: of the samples in the tables.
             weights: of the samples.
             live: samples of each ray.
             errors: squared errors of the rays' colours, 0 where a ray has none.
@@ -254,11 +255,11 @@ class TexelTables(Field):
 
     @torch.no_grad()
     def release_unused(self, least: float) -> Int[Tensor, "K"] | None:
-        """Releases the bricks in which no training sample had the weight ``least``, and resets the records.
+        """Releases the bricks in which no training sample had the weight ``least``, and resets the records of use.
 
         Returns:
             Previous numbers of the remaining bricks (for ``TouchedAdam.keep_bricks``); None if nothing changed, for
-            example because too few rays were seen.
+            example after too few rays.
         """
         enough = float(self.crossings) >= ENOUGH_CROSSINGS * self.num_bricks
         kept = self._keep(self.peak >= least) if enough else None
@@ -273,7 +274,7 @@ class TexelTables(Field):
 
     @torch.no_grad()
     def release_untouched(self) -> Int[Tensor, "K"] | None:
-        """Empties the texels that no ray trained: alpha 0, no vote in the blending. Returns as ``release_unused``."""
+        """Empties the texels that no ray trained: alpha 0, no share in the blending. Returns as ``release_unused``."""
         self.density.data[self.touched == 0] = RELEASED_DENSITY
         return self._keep(self.touched.view(-1, BRICK).any(-1))
 
@@ -302,7 +303,7 @@ class TexelTables(Field):
         plan = ScenePlan.from_json(to_text(plan_bytes))
         copied = bool(state_dict[prefix + "copied"])
         self.build(plan, float(state_dict[prefix + "texel_factor"]), state_dict[prefix + "tiles"], copied)
-        self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as it was written, whatever a plan has now
+        self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as written, even if plans have other fields now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 

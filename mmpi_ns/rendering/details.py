@@ -1,12 +1,12 @@
-"""Details: what the field lacks in its training images, added to images of the same surfaces from elsewhere.
+"""Details: residuals of the nearest training images, added to rendered images where they see the same surfaces.
 
-A field is smooth where rays are few, and colours that change with the viewing direction faster than its network are
-averaged. The difference of each training image from its rendering is kept with the rendered depths. An image from
-another place adds the differences of the nearest training images, each where it shows the same surface, the more the
-nearer its viewing direction is. A field fits its training images more closely than others: what it has learned of one
-image alone is no difference there, but lacks elsewhere, so a part of each difference is from the rendering to which it
-is added. Source: weights as in unstructured lumigraph rendering (Buehler et al. 2001), applied
-to differences instead of colours, so that what no training image shows stays the field's.
+A field is smooth where rays are few, and averages colours that change with the viewing direction faster than its
+network can model. The residual of each training image is stored with the rendered depths. A rendered image adds the
+residuals of the nearest training images where they see the same surface, with weights that fall with the angle between
+the viewing directions. A field overfits its training images: part of what other views lack is no residual there, so a
+part of each residual is taken against the image being rendered. Source: weights as in unstructured lumigraph rendering
+(Buehler et al. 2001), applied to residuals instead of colours, so that surfaces that no training image sees are the
+field's.
 """
 
 from __future__ import annotations
@@ -37,18 +37,19 @@ from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import write_atomically
 
 MAX_ANGLE = 45.0
-"""Between the viewing directions of an image and of the training images that it takes details from, degrees."""
+"""Maximum angle between the viewing directions of an image and of the training images whose details it adds,
+degrees."""
 LARGEST = 0.5
-"""Largest difference that is kept, of colours in [0, 1]."""
+"""Maximum residual, of colours in [0, 1]."""
 LEVELS = 127
-"""Levels of a difference to either side of 0: half of a grey level each."""
+"""Levels of a residual to either side of 0: half of a grey level each."""
 PART = 2**18
 """Rays whose details are computed at once."""
 DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-"""What reading a damaged file raises."""
+"""Exceptions of reading a damaged file."""
 DETAILS_FOLDER = "details"
 CAMERAS_FILE = "cameras.npz"
-"""Written last, so that a folder without it is none."""
+"""Written last, so that a folder without it is incomplete."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,13 @@ class DetailView:
     """A training image, as ``ops.details.seen_details`` needs it."""
 
     image: Float[Tensor, "H W 4"]
-    """Difference of the radiance (image minus ``1 - HERE`` of its rendering, ``HERE * MIDDLE`` lower: red, green,
-    blue), and inverse distance along the ray; -1 where the image is masked."""
+    """Residual of the radiance (image minus ``1 - HERE`` of its rendering, ``HERE * MIDDLE`` lower: red, green, blue),
+    and inverse distance along the ray; -1 where the image is masked."""
     camera: Float[Tensor, "24"]
 
 
 class Details:
-    """Training images with what the field lacks in them, read as images need them.
+    """Residuals of the training images, read when an image needs them.
 
     Args:
         cameras: of the training images, as ``ops.details.seen_details`` takes them. [N, 24]
@@ -77,13 +78,14 @@ class Details:
     def added(
         self, outputs: dict[str, Tensor], bundle: RayBundle, nearest: int, exposure: Float[Tensor, "3"] | None
     ) -> dict[str, Tensor]:
-        """The outputs of an image [H, W, C] with details in rgb and radiance; the field's own begin with ``field_``.
+        """Outputs of an image [H, W, C] with details in rgb and radiance; those of the field alone begin with
+        ``field_``.
 
         Args:
             outputs: of the field.
             bundle: rays of the image. [H, W]
-            nearest: number of training images that it takes details from. The next one's distance is where shares
-                reach 0, so that none appears at once as a camera moves.
+            nearest: number of training images whose details are added. Shares reach 0 at the distance of the next one,
+                so that none appears suddenly as a camera moves.
             exposure: of rgb over the radiance; None if they are the same.
         """
         origins, directions = bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)
@@ -91,7 +93,7 @@ class Details:
         pose[0, :, 3], ahead = origins[0].double().cpu().numpy(), directions.double().mean(0).cpu().numpy()
         length = float(np.linalg.norm(ahead))
         pose[0, :, 2] = -ahead / max(length, 1e-9)
-        angle = MAX_ANGLE if length > 0.5 else 180.0  # a panorama looks everywhere
+        angle = MAX_ANGLE if length > 0.5 else 180.0  # a panorama faces all directions
         chosen = nearest_views(np.concatenate([self._poses, pose]), len(self._poses), nearest + 1, angle, apart=False)
         distances = np.linalg.norm(self._poses[chosen, :, 3] - pose[0, :, 3], axis=-1)
         limit = distances[-1] if len(chosen) > nearest and distances[-1] > 0 else np.inf
@@ -101,7 +103,7 @@ class Details:
         rays = origins, directions, disparities, radiance.reshape(-1, 3)
         for starts, ways, near, field in zip(*(x.split(PART) for x in rays), strict=True):
             total, weight = torch.zeros_like(starts), torch.full_like(near, LEAST_WEIGHT)
-            for view, share in zip(views, shares, strict=True):  # the weighted mean of what they show
+            for view, share in zip(views, shares, strict=True):  # the weighted mean of their residuals
                 difference, seen = seen_details(starts, ways, near, field, view.image, view.camera)
                 total += share * seen * difference
                 weight += share * seen
@@ -115,8 +117,8 @@ class Details:
 
 
 def details_of(folder: Path, step: int) -> Details | None:
-    """What ``write_details`` has written for the checkpoint of a step; None if there is nothing, or it is another's.
-    Raises InputError if it is damaged."""
+    """Details that ``write_details`` wrote for the checkpoint of a step; None without any, or if they belong to another
+    step. Raises InputError if it is damaged."""
     if not (folder / CAMERAS_FILE).is_file():
         return None
     kept_at, cameras, _ = _load(folder / CAMERAS_FILE, "step", "cameras", "here")  # differences without HERE differ
@@ -142,7 +144,7 @@ def _load(path: Path, *names: str) -> list[Tensor]:
 
 
 def moved_cameras(cameras: Cameras, poses: CameraOptimizer) -> Cameras:
-    """Cameras where an optimiser of their poses has moved them."""
+    """Cameras with the refined poses of an optimiser."""
     if poses.config.mode == "off":
         return cameras
     moves, cameras = poses(list(range(len(cameras)))).detach(), copy(cameras)
@@ -161,14 +163,14 @@ def write_details(
     image_of: Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8]]],
     outputs_of: Callable[[RayBundle], dict[str, Tensor]],
 ) -> str:
-    """Renders all training images and writes what the field lacks in them; what was made of it, as a sentence.
+    """Renders all training images and writes their residuals; returns a sentence about them.
 
     Args:
-        folder: is made, and filled anew.
+        folder: created, or emptied.
         step: of the checkpoint that the details belong to.
-        cameras: of the N training images, where training has moved them.
+        cameras: of the N training images, with refined poses.
         factors: exposures of the images over that of the field; empty if they are the same.
-        image_of: colours of a training image [H, W, 3 or 4], and where they may be used [H, W].
+        image_of: colours of a training image [H, W, 3 or 4], and mask of its usable pixels [H, W].
         outputs_of: the field's outputs for the rays of an image: depth, and radiance or rgb [H, W, C].
 
     Raises:
@@ -204,7 +206,7 @@ def write_details(
 
 
 def _camera_row(camera: Cameras, bundle: RayBundle, fisheye: bool) -> NDArray[np.float32]:
-    """The numbers of a camera that ``seen_details`` takes. [24]"""
+    """Parameters of a camera for ``seen_details``. [24]"""
     pose = camera.camera_to_worlds.reshape(3, 4)
     local = bundle.directions.reshape(-1, 3) @ pose[:, :3]
     radius, ahead = local[:, :2].norm(dim=-1), -local[:, 2]

@@ -20,9 +20,9 @@ SHOWN_RAYS = 4 * CPU_RAYS
 GPU_RAYS = 1 << 20
 """Most rays of a chunk on a GPU: a frame of 1242 x 375, or half of one of 1920 x 1080."""
 BYTES_PER_SAMPLE = 128
-"""Peak bytes for every plane that a ray may cross: hits, kept samples, colours."""
+"""Peak bytes per plane that a ray may intersect: hits, kept samples, colours."""
 BYTES_PER_SLOT = 40
-"""Bytes of one compiled pass for every sample that a ray may keep."""
+"""Bytes of one compiled pass per sample that a ray may keep."""
 FREE_SHARE = 0.5
 """Fraction of the device's free memory; the rest is left to other programs."""
 
@@ -41,7 +41,7 @@ def render_windows(
         windows: the trained ones.
         render: outputs [P, C] of one window, given its index and the numbers of its rays. Called once for each window,
             so that a window is read from disk once at most, however many rays there are.
-        shown: index of the window that renders all rays; None: those that they start in.
+        shown: index of the only window to render; None: the windows that the rays start in.
         in_memory: windows to render first, before the reading of another one evicts them.
     """
     shares = window_shares(origins, windows)
@@ -68,7 +68,7 @@ def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass:
         samples_per_ray: maximum samples of a ray: the planes of all MPIs and the steps through the cube.
         device: where they are rendered.
         kept_in_one_pass: samples that a ray can keep, if images are rendered in one compiled pass (``ops.march``),
-            which stores nothing of the others; None if they are rendered step by step.
+            which stores no other samples; None if they are rendered step by step.
 
     Returns:
         A power of two; on a GPU from ``CPU_RAYS`` to ``GPU_RAYS``.

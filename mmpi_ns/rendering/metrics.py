@@ -15,14 +15,14 @@ from torch.nn.functional import pad
 MOST_SORTED = 1 << 20
 """Pixels used for the brightness range of a depth image; torch computes quantiles of at most 16.7 M."""
 PART = 1 << 18
-"""Pixels that are compared at once: all of a photo of 12 megapixels would take 8 GiB."""
+"""Pixels compared at once: all of a 12-megapixel photo would take 8 GiB."""
 WINDOW = 11
 """Side of SSIM's window, pixels."""
 
 
 @dataclass(eq=False)
 class ImageMetrics:
-    """Metrics of a rendered image. LPIPS downloads its weights on first use and is left out without them."""
+    """Metrics of a rendered image. LPIPS downloads its weights on first use and is omitted without them."""
 
     lpips_net: Literal["vgg", "alex", "none"]
     _lpips: nn.Module | None = None
@@ -53,7 +53,7 @@ class ImageMetrics:
 
 
 def psnr_and_ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
-    """Both of an image in [0, 1]; PSNR alone of one that is smaller than SSIM's window."""
+    """PSNR and SSIM of an image in [0, 1]; PSNR alone if it is smaller than SSIM's window."""
     values = {"psnr": psnr(predicted, observed)}
     return values if min(predicted.shape[:2]) < WINDOW else values | {"ssim": ssim(predicted, observed)}
 
@@ -83,7 +83,7 @@ def ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) ->
 
 
 def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:
-    """Images for display of a rendered image. Pixels that a texel spans: blue from 1/2, green 2, red from 8 on."""
+    """Pictures of a rendered image's outputs. Pixels per texel: blue up to 1/2, green 2, red from 8 on."""
     near = 1 / outputs["depth"].clamp(min=1e-9)
     some = near.flatten()[:: 1 + near.numel() // MOST_SORTED]
     return {

@@ -26,18 +26,18 @@ class WindowStore:
     """Finished windows, one file each. Several threads may render from one store."""
 
     folder: Path | None
-    """Of the files; None if there is only one window."""
+    """Folder of the files; None if there is only one window."""
     empty: Callable[[], MMPIField]
-    """Makes a field of the run's settings to load into."""
+    """Factory of fields with the run's settings, to load into."""
     budget: float = 0.0
     """Bytes of the windows kept for rendering. The window being rendered is kept in any case."""
     _thread: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, "mmpi-windows"))
-    """Reads and evicts windows, one at a time. The viewer stops a rendering by an exception in its own thread, at any
-    line: work that must not be left half-done is done in this one."""
+    """Thread that reads and evicts windows, one at a time. The viewer interrupts a rendering by an exception in its
+    thread, at any line, so work that must be finished is done here."""
     _held: dict[int, MMPIField] = field(default_factory=dict)
     """Windows in memory, the most recently used last."""
     _alive: WeakValueDictionary[int, MMPIField] = field(default_factory=WeakValueDictionary)
-    """These and windows still in use: evicting a window does not take it from a thread that is rendering it."""
+    """These, and evicted windows that a thread is still rendering."""
 
     def path(self, window: int) -> Path:
         assert self.folder is not None, "several windows need a folder"
@@ -68,7 +68,7 @@ class WindowStore:
             device: to load it to.
 
         Raises:
-            InputError: the file is missing or damaged (says which, and what to do).
+            InputError: the file is missing or damaged; the message names it and the remedy.
         """
         return self._thread.submit(self._load, window, device).result()
 

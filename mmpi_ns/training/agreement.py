@@ -1,4 +1,4 @@
-"""Whether the compiled operations agree with plain torch on this device: one small batch, values and gradients."""
+"""Check that the compiled operations agree with plain torch on this device: values and gradients of a small batch."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from mmpi_ns.rendering.rendered import render_rays
 RAYS = 256
 """Rays of the batch."""
 CLOSE = 1e-2
-"""Largest difference, as a norm relative to that of plain torch. A sample whose weight is the threshold's to the last
-bits may be kept by one form alone; a wrong kernel is off by more."""
+"""Maximum difference, as a norm relative to plain torch's. A sample whose weight equals the threshold up to rounding
+may be kept by one form alone; a wrong kernel differs by more."""
 
 
 def disagreement(field: MMPIField, bundle: RayBundle, options: MarchOptions) -> str:
-    """What the compiled operations compute otherwise than plain torch, in words; empty where they agree.
+    """Description of the differences between compiled operations and plain torch; empty if they agree.
 
     Args:
         field: to render.
@@ -63,7 +63,7 @@ def gradients_of(field: MMPIField) -> dict[str, Rows]:
 
 
 def differences(reference: dict[str, Rows], others: dict[str, Rows]) -> list[str]:
-    """Which values differ by more than ``CLOSE``, and by how much, in words."""
+    """Descriptions of the values that differ by more than ``CLOSE``."""
     wrong = []
     for name, rows in reference.items():
         first, second = _on_same_rows(rows, others[name])

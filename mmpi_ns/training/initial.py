@@ -1,7 +1,7 @@
-"""Tables before the first step: surfaces where depths are known (docs/how_it_works.md, "Initial surfaces").
+"""Tables before the first step: surfaces at the depth priors (docs/how_it_works.md, "Initial surfaces").
 
-Without it every plane starts with the same weight, and surfaces form out of fog: a ray then has hundreds of samples
-that all learn. A ray of known depth says where its surface is, and that the planes before it are empty.
+Otherwise every plane starts with the same weight, and a ray has hundreds of samples that all learn until surfaces form.
+A ray with a depth prior votes for a surface there, and for empty space on the planes before it.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from mmpi_ns.utils.random_draws import generator
 BATCHES, BATCH = 20, 4096
 """Batches of rays that vote, and pixel rays of a batch; rays of new views come on top."""
 PRIOR = 64.0
-"""Votes that the equal weight of all planes counts as."""
+"""Number of votes of the prior, equal weights of all planes."""
 PLANE_ERROR = 0.6
 """Minimum error of a depth, in plane spacings: a surface between two planes is on both."""
 EMPTY_FROM = 2.0
-"""Errors before a surface from which on a ray's planes are empty."""
+"""Distance before a surface, in errors, beyond which a ray's planes get votes for empty space."""
 DARKEST = 0.02
-"""Colours start between this and its complement, so that their logits can still move."""
+"""Minimum initial colour, and its complement the maximum, so that gradients of the logits do not vanish."""
 
 
 class Votes(NamedTuple):
-    """What rays of known depth say of each of the T rows of the tables."""
+    """Votes of rays with a depth prior for each of the T rows of the tables."""
 
     surface: Float[Tensor, "T"]
-    """Votes for a surface: of one ray, all planes within the error of its depth together have about one."""
+    """Votes for a surface; those of one ray, on all planes within the error of its depth, sum to about one."""
     empty: Float[Tensor, "T"]
-    """Rays that pass and reach their surface behind."""
+    """Votes for empty space: rays whose surface lies behind."""
     colors: Float[Tensor, "T 3"]
-    """Colours of the votes for a surface, summed."""
+    """Sum of the colours of the votes for a surface."""
 
     def add(
         self,
@@ -50,7 +50,7 @@ class Votes(NamedTuple):
         colors: Float[Tensor, "R 3"],
         ray_near: float,
     ) -> None:
-        """Adds the votes of rays, each for the texel nearest to it on every plane that it crosses.
+        """Adds the votes of rays, each for the nearest texel on every plane that it intersects.
 
         Args:
             layout: MPIs and texels at the resolution in use.
@@ -67,7 +67,7 @@ class Votes(NamedTuple):
             last = hits.m_first[:, k, None] - hits.count[:, k, None]
             w = sample_disparity(m, layout.frames.disparity_steps[k], layout.frames.last_disparities[k])
             oz, dz = hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]
-            # How far apart planes are along the ray, in inverse distance; at the camera itself they are no surface.
+            # Spacing of the planes along the ray, in inverse distance; planes at the camera are excluded.
             spacing = mpi.disparity_step * dz.abs() / (1 - w * oz).clamp(min=1e-3) ** 2
             error = torch.maximum(depths[:, 1:], PLANE_ERROR * spacing)
             before = (inverse_distance(w, oz, dz) - depths[:, :1]) / error
@@ -90,8 +90,8 @@ class Votes(NamedTuple):
 def start_from_votes(field: MMPIField, votes: Votes) -> None:
     """Sets densities and diffuse colours of the texels that have votes.
 
-    The alpha of a texel is the share of its votes that are for a surface, among PRIOR votes for the alpha with which
-    all planes have equal weight. Texels without votes, and the empty brick, stay as they are.
+    The alpha of a texel is the share of its votes for a surface, with PRIOR further votes at the alpha of equal
+    weights. Texels without votes, and the empty brick, do not change.
     """
     layout = field.layout
     for k, (mpi, grid) in enumerate(zip(layout.mpis, layout.grids, strict=False)):
@@ -111,10 +111,10 @@ def start_from_votes(field: MMPIField, votes: Votes) -> None:
 
 
 def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:
-    """Starts a field from the known depths of the training pixels and new views that a window draws from.
+    """Initialises a field from the depth priors of a window's training pixels and new views.
 
     Args:
-        field: just built.
+        field: new.
         sources: of its rays.
         seed: of the run.
     """

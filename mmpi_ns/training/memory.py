@@ -1,4 +1,4 @@
-"""Plan and memory of a run, reported before it starts."""
+"""Memory of a run, estimated and reported before it starts."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ GIB = 2**30
 LEAST_SHARE = 0.02
 """Fraction of a plan's texels assumed to be in reach of training rays; computing it takes time."""
 RAYS_PER_PIXEL_RAY = 2
-"""Rays of a step for each pixel ray at most: new views and keypoints too."""
+"""Maximum rays of a step per pixel ray, with new views and keypoints."""
 TYPICAL_WIDTH, TYPICAL_KEPT = 256, 64
-"""Samples that the widest ray of a batch keeps once surfaces have formed, and that rays keep on average, at most."""
+"""Maximum samples that a ray keeps once surfaces have formed, and maximum mean over rays."""
 BYTES_PER_SLOT = 32
-"""Of a step for each sample that a ray may keep, before the samples are packed."""
+"""Bytes of a step per sample that a ray may keep, before the samples are packed."""
 BYTES_PER_PACKED = 112
-"""Of a step for each ray and slot of the widest ray: what is packed, weights, losses, and their gradients."""
+"""Bytes of a step per ray and slot of the widest ray: packed samples, weights, losses, and their gradients."""
 BYTES_PER_TAP = 24
-"""Of a step for each texel that a kept sample reads: row, place among the distinct rows, weights and gradients."""
+"""Bytes of a step per texel that a kept sample reads: row, index among the distinct rows, weights and gradients."""
 COPIES = 4
-"""Of the distinct rows that a step reads: values, gradients, what total variation adds, the optimiser's."""
+"""Arrays of the distinct rows that a step reads: values, gradients, total variation, optimiser."""
 ALLOCATOR_SHARE, ALLOCATOR_BYTES = 0.1, 2**28
-"""What torch's allocator cannot reuse, and what libraries and compiled kernels take on a GPU."""
+"""Bytes that torch's allocator cannot reuse, and bytes of libraries and compiled kernels on a GPU."""
 SMALLEST_PLAN = 1e5
 """Texels below which a window is not worth training."""
 ATTEMPTS = 4
@@ -42,20 +42,20 @@ ATTEMPTS = 4
 
 @dataclass(frozen=True)
 class Work:
-    """What a training needs memory for, besides its plan."""
+    """Settings of a training that determine its memory, besides the plan."""
 
     feature_channels: int
     """Colour features of a texel."""
     two_phase: bool
     """Whether reliability is trained, so that it has moments."""
     pixel_rays: int = 0
-    """Of a step."""
+    """Rays of a step."""
     threshold: float = 3e-3
-    """Weight that a sample must have to be kept once surfaces have formed."""
+    """Minimum weight of a kept sample once surfaces have formed."""
     all_mpis: bool = False
     """Whether each MPI renders all rays for a while."""
     sample_bytes: int = 0
-    """Of the network of every sample: what it holds for the gradients of one."""
+    """Bytes per sample that a network evaluated for every sample stores for its gradients."""
 
 
 def fit_memory(
@@ -70,7 +70,7 @@ def fit_memory(
     Args:
         windows: of the capture.
         views_of: training images of a window.
-        work: what else is kept in memory.
+        work: settings of the training.
         device: on which it will be trained.
         again: plans anew with at most so many texels a window; None where a plan was asked for.
 
@@ -85,7 +85,7 @@ def fit_memory(
         for window in windows.windows:
             plan, seen = window.plan, views_of(window)
             free, whole = free_memory(device) - reserved_bytes(plan, work, device), training_bytes(plan, None, work)
-            # To find the tiles in reach: marks, and the 4 side planes of every image at the tiles of one plane.
+            # For the reachable tiles: masks, and the 4 side planes of every image at the tiles of one plane.
             cameras = 0 if seen is None else len(seen.origins)
             largest = max(-(-height // SIDE) * -(-width // SIDE) for _, height, width in head_shapes(plan))
             looking = 8 * count_tiles(plan) + 4 * 8 * 3 * cameras * largest
@@ -111,10 +111,10 @@ def fit_memory(
 
 
 def reserved_bytes(plan: ScenePlan, work: Work, device: str | torch.device) -> int:
-    """Bytes of a GPU that tables must leave: for a step at full resolution, when rays end at surfaces, for a picture in
-    the viewer, and for torch's allocator.
+    """Bytes of a GPU to reserve beside the tables: for a step at full resolution, once surfaces have formed, for an
+    image in the viewer, and for torch's allocator.
 
-    A machine without a GPU has its program and a step's buffers in memory that it can swap: 0.
+    0 on a CPU, whose memory can be swapped.
     """
     if torch.device(device).type != "cuda":
         return 0
@@ -142,7 +142,7 @@ def training_bytes(plan: ScenePlan, views: TrainingViews | None, work: Work, dev
         plan: MPIs and cube.
         views: training images; texels that none can reach are not stored. None: all are stored.
         work: what is trained.
-        device: where tiles in reach are looked for.
+        device: where the reachable tiles are computed.
     """
     tiles = count_tiles(plan)
     stored = tiles if views is None else int(reachable_tiles(views, plan, device).sum())
@@ -153,13 +153,13 @@ def stored_bytes(bricks: int, tiles: int, work: Work) -> int:
     """Bytes of tables with a number of bricks besides the empty one, and of their moments.
 
     Args:
-        bricks: that hold a tile.
+        bricks: number of bricks with a tile.
         tiles: of all planes, stored or not.
         work: what is trained.
     """
     learned = 1 + work.feature_channels + work.two_phase
     numbers, moments = 1 + work.feature_channels + 1, 2 * learned  # density, features, reliability; float32, bfloat16
-    # Also marks of touched texels, peaks and gains of bricks, and the tile map.
+    # Plus masks of touched texels, peaks and gains of bricks, and the tile map.
     return (bricks + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 8) + 4 * tiles
 
 

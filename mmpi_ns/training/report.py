@@ -18,14 +18,14 @@ from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import duration, quoted, say
 
 FIRST_LINE, SHARE = 10, 0.025
-"""A line after this many steps, then after each such fraction of all steps."""
+"""Steps before the first progress line, and fraction of all steps between two."""
 LEAST_SECONDS, MOST_SECONDS = 2.0, 30.0
-"""Between two lines."""
+"""Minimum seconds between two lines."""
 VIEWS, LOOK_SECONDS = 4, 20.0
-"""The quick test: maximum number of test images, and seconds after which no further one is started."""
+"""Quick test: maximum number of test images, and seconds after which no further one is started."""
 CPU_RAYS = 15000.0
-"""Pixel rays/s that one core trains with its defaults: 21,000 on kitti-street at a quarter, 12,000 on
-kitchen at a half (one core of an Intel Xeon)."""
+"""Pixel rays/s that one core trains with default settings: 21,000 on kitti-street at a quarter, 12,000 on kitchen at a
+half (one core of an Intel Xeon)."""
 ONE_THREAD = 0.6
 """Share of a training that runs on one thread: 1,500 steps of kitti-street /4 took 78 s with one thread, 62 s with two
 on two free cores (docs/ablations.md)."""
@@ -38,15 +38,15 @@ class TrainingLog:
     schedule: Schedule
     """Of the run."""
     rays: int
-    """Of a step after the texels have grown."""
+    """Pixel rays of a step after the texels have grown."""
     first: int
     """First step."""
     end: int
     """Step after the last one."""
     _said_at: float = 0.0
-    """When the last line was printed,"""
+    """Time of the last line,"""
     _said: int = 0
-    """and the steps that were done then."""
+    """and number of steps at that time."""
     _phase: str = ""
 
     def note(self, step: int, rgb_loss: Tensor) -> None:

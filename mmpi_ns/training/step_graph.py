@@ -1,11 +1,11 @@
-"""A training step on a GPU as two CUDA graphs: what draws, renders and finds gradients, and what takes the step.
+"""A training step on a GPU as two CUDA graphs: draws, rendering and gradients in one, the optimiser in the other.
 
 A step launches some hundreds of small kernels, and the host needs longer to launch them than the GPU to run them. A
-graph launches them at once. It repeats a step on the same memory, so all sizes are fixed (``Capacity``), nothing is
-waited for, random streams start anew from outside (``Generators``), and numbers that change lie in tensors.
+graph launches them at once. It replays a step on the same memory, so all sizes are fixed (``Capacity``), there is no
+synchronisation, random streams are seeded from outside (``Generators``), and values that change are in tensors.
 
-Steps of a kind are recorded after a few that were run one operation at a time and measured how many samples there are.
-A step whose samples do not fit changes nothing. The host hears of it some steps later and records again with more room.
+Steps of a kind are recorded after a few ordinary ones, which measure the number of samples. A step whose samples exceed
+the capacity changes nothing. The host reads this some steps later and records again with a larger capacity.
 """
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ from mmpi_ns.utils.random_draws import Generators
 MEASURED = 3
 """Steps after a change of the tables that are measured before one is recorded."""
 MARGIN = 1.125
-"""Room over the most samples so far: of a hundred steps none had more than 1.044 times those of the sixteen before."""
+"""Capacity relative to the most samples so far: of a hundred steps none had more than 1.044 times those of the sixteen
+before."""
 MORE = 1024
-"""Room for so many samples of each head, and rows, beyond that."""
+"""Additional capacity in samples of each head, and rows."""
 FULL = 0.97
-"""Share of the room from which there is more of it from the next step on."""
+"""Share of the capacity above which it is increased from the next step on."""
 LATE = 4
-"""Steps that the host runs ahead at most."""
+"""Maximum number of steps that the host runs ahead."""
 SMALL = 1e-4
-"""Values below are compared as if they were this large."""
+"""Minimum magnitude in relative comparisons."""
 
 
 class Recording(Protocol):
-    """Operations that can be repeated."""
+    """Recorded operations."""
 
     def replay(self) -> None: ...
 
 
 class Recorder:
-    """Records what a function does on a GPU, without doing it."""
+    """Recorder of a function's operations on a GPU, without running them."""
 
     def __init__(self) -> None:
         self.pool = torch.cuda.graph_pool_handle()
@@ -60,7 +61,7 @@ class Recorder:
         graph = torch.cuda.CUDAGraph()
         for g in generators:
             graph.register_generator_state(g)
-        # Threads that show images meanwhile may allocate memory, and a kernel may be compiled or loaded.
+        # Threads that render images meanwhile may allocate memory, and a kernel may be compiled or loaded.
         with torch.cuda.graph(graph, pool=self.pool, capture_error_mode="relaxed"):
             run()
         return graph
@@ -68,7 +69,7 @@ class Recorder:
 
 @dataclass
 class Results:
-    """What a step leaves behind for the host: tensors that the next step of the kind overwrites."""
+    """Results of a step for the host: tensors that the next step of the kind overwrites."""
 
     names: list[tuple[str, str]] = field(default_factory=list)
     """("loss" or "metric", name) of the values."""
@@ -99,7 +100,7 @@ class Recorded:
 
 
 class StepGraphs:
-    """Trains a model on a GPU, with graphs once it is known how much room steps need.
+    """Training of a model on a GPU, with graphs once the capacity that steps need is measured.
 
     Args:
         model: ``MMPIModel``, to train.
@@ -121,15 +122,15 @@ class StepGraphs:
         self._forget()
 
     def _forget(self) -> None:
-        """The tables have changed: nothing that was recorded holds any more."""
+        """Invalidates all recordings after a change of the tables."""
         self._drop()
         self._pending: deque[tuple[Any, Tensor, Capacity]] = deque()
         self._measured, self._most, self.capacity = 0, Counter[int](), None
 
     def _drop(self) -> None:
-        """Drops what was recorded, with its memory."""
+        """Frees the recordings and their memory."""
         self._recorded: dict[Any, Recorded] = {}
-        self._recorder = None  # torch shares no memory of graphs that are gone
+        self._recorder = None  # torch does not share memory of freed graphs
 
     # A step ------------------------------------------------------------------------------------------------------
 
@@ -160,8 +161,8 @@ class StepGraphs:
         return recorded.results.told()
 
     def _kind(self, step: int) -> Any:
-        """What steps have in common that do the same operations on the same memory. Forgets what was recorded before a
-        change of the tables."""
+        """Key of the steps that run the same operations on the same memory. Invalidates recordings made before a change
+        of the tables."""
         model, manager = self.model, self.manager
         run, fields = model.run, model.field
         schedule = model.progress.schedule
@@ -176,7 +177,7 @@ class StepGraphs:
         return step % TV_EVERY == 0, schedule.watches(step)
 
     def _start(self, step: int) -> None:
-        """Sets what recorded steps take from outside."""
+        """Sets the inputs of recorded steps."""
         self.model.decay.fill_(self.model.progress.schedule.decay(step))
         for generators in self.generators:
             generators.start(step)
@@ -186,7 +187,7 @@ class StepGraphs:
             optimizer.zero_grad(set_to_none=True)
 
     def _find_gradients(self, step: int, capacity: Capacity | None) -> Results:
-        """Draws rays, renders them and finds gradients of the losses; nothing is changed but the records of use."""
+        """Draws rays, renders them and computes gradients of the losses; changes only the records of use."""
         model, results = self.model, Results()
         model.capacity = capacity
         try:
@@ -214,7 +215,7 @@ class StepGraphs:
         return results
 
     def _measured_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        """One operation at a time, with as much room as there are samples."""
+        """An ordinary step, with as much capacity as there are samples."""
         self._zero_grad()
         results = self._find_gradients(step, None)
         for optimizer in self.optimizers.values():
@@ -229,14 +230,14 @@ class StepGraphs:
         self._note([samples.valid.shape[1], *(samples.head_counts or ()), len(lookup.rows)])
 
     def _note(self, used: list[int]) -> None:
-        """Counts what a step needed into the room of the next ones."""
+        """Includes the samples of a step in the capacity of the next ones."""
         for place, number in enumerate(used):
             self._most[place] = max(self._most[place], number)
         slots, *heads, rows = (int(MARGIN * self._most[place]) for place in range(len(used)))
         self.capacity = Capacity(slots + 2, tuple(n + MORE for n in heads), rows + MORE)
 
     def _send(self, results: Results) -> None:
-        """Has the numbers of a step copied to the host."""
+        """Copies the counts of a step to the host."""
         assert results.used is not None and self.capacity is not None
         if results.used.is_cuda:
             here = torch.empty(results.used.shape, dtype=results.used.dtype, pin_memory=True)
@@ -249,7 +250,7 @@ class StepGraphs:
         self._hear(wait=len(self._pending) > LATE)
 
     def _hear(self, wait: bool) -> None:
-        """Reads the numbers of steps that are finished; ``wait``: of one at least."""
+        """Reads the counts of finished steps; ``wait``: of one at least."""
         while self._pending:
             event, here, capacity = self._pending[0]
             if event is not None and not event.query():
@@ -261,7 +262,7 @@ class StepGraphs:
             used, room = here.tolist(), (capacity.slots - 1, *capacity.heads, capacity.rows)
             self.lost += any(n > most for n, most in zip(used, room, strict=True))
             full = [n > FULL * most for n, most in zip(used, room, strict=True)]
-            if any(full) and capacity is self.capacity:  # what does not fit may not be counted whole
+            if any(full) and capacity is self.capacity:  # samples beyond the capacity may not be counted in full
                 counts = zip(used, room, full, strict=True)
                 self._note([max(n, int(MARGIN * n), most) if is_full else n for n, most, is_full in counts])
                 self._drop()
@@ -279,7 +280,7 @@ class StepGraphs:
                 generators.recording = False
 
     def _record(self, step: int, kind: Any) -> Recorded | None:
-        """Records a kind of step and runs its first half; None where it would compute something else."""
+        """Records a kind of step and runs its first half; None if the replay differs."""
         capacity, fields = self.capacity, self.model.field
         assert capacity is not None
         of_kind = (*kind, *self._state[6:])
@@ -319,7 +320,7 @@ class StepGraphs:
 
     @staticmethod
     def _difference(expected: Any, repeated: Any) -> str:
-        """In words; empty where they agree but for what the order of atomic sums explains."""
+        """Description of the difference; empty if they agree up to the order of atomic sums."""
         (values, gradients), (others, their) = expected, repeated
         error = float(((others - values).abs() / values.abs().clamp(min=SMALL)).max())
         losses = [] if error <= CLOSE else [f"losses by {error:.1%}"]

@@ -24,11 +24,12 @@ from mmpi_ns.utils.host import give_back_freed_memory
 FORMING = 0.4
 """Factor of the weight below which bricks are released while surfaces still form."""
 WORTH = 1.25
-"""Least multiple of texels for which tables grow beyond the plan."""
+"""Minimum factor by which texels grow beyond the plan."""
 ROOM = 0.4
-"""Share of the planned memory that finer texels may fill: more learn single images (docs/ablations.md)."""
+"""Share of the planned memory that finer texels may fill: with more, texels overfit single images
+(docs/ablations.md)."""
 MOST_COPIED = 0.1
-"""Share of the bricks that get a finer copy for their own errors; those beside them get one, too."""
+"""Share of the bricks that get a finer copy for their errors; adjacent bricks get one, too."""
 
 
 def prepare_storage(
@@ -54,7 +55,7 @@ def prepare_storage(
     gain = field.gain if schedule.refines_at(step, copies=True) else None
     if schedule.releases_at(step):
         remaining.append(field.release_unused(FORMING * least if grows else least))
-    if grows:  # what has just been released does not grow
+    if grows:  # released bricks do not grow
         field.grow(factor)
         give_back_freed_memory()
     elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
@@ -97,8 +98,8 @@ def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any,
 def copy_finely(
     field: TexelTables, gain: Float[Tensor, "B"], work: Work, budget: int, trained: list[tuple[Any, Any]]
 ) -> None:
-    """Gives MPIs, which have none yet, finer copies of the bricks in which training rays have the largest errors
-    (``TexelTables.gain``), and of those beside them. Arguments are those of ``refine``."""
+    """Makes finer copies of the bricks in which training rays have the largest errors (``TexelTables.gain``), and of
+    adjacent ones, if there are none yet. Arguments are those of ``refine``."""
     grids, copies = field.grids, field.copy_grids()
     first_voxel = sum(grid.own_tiles.numel() for grid in grids[: len(copies)])
     order = gain[1:].argsort(descending=True, stable=True) + 1

@@ -1,1 +1,1 @@
-"""Small helpers that know nothing of scenes: files, messages, keyed random draws."""
+"""Helpers independent of scenes: files, messages, keyed random draws."""

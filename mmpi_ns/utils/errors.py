@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, or of a user's share of it."""
 NO_MEMORY = "can't allocate memory|out of memory|Insufficient memory|can't start new thread|bad_alloc"
-"""In errors of torch, CUDA, OpenCV, Python and C++ that ask for too much memory, or too many threads."""
+"""Messages of torch, CUDA, OpenCV, Python and C++ for lack of memory or threads."""
 
 
 class InputError(ValueError):
@@ -28,8 +28,8 @@ class WriteError(InputError, OSError):
 
 
 def used_up(error: BaseException) -> str | None:
-    """A sentence for an error of a full disk or of memory that is used up, of the computer or a GPU; None for any other
-    error, and where there is a sentence."""
+    """A sentence for an error of a full disk or exhausted memory, of the computer or a GPU; None for any other error,
+    and if it is a sentence already."""
     if isinstance(error, InputError):
         return None
     number = getattr(error, "errno", None)
@@ -48,22 +48,22 @@ def used_up(error: BaseException) -> str | None:
 
 
 def brief(error: BaseException) -> str:
-    """First sentence of an error, to quote in brackets in a sentence of ours."""
+    """First sentence of an error, to quote in brackets."""
     return str(error).strip().split("\n")[0].split(". ")[0].rstrip(" .")
 
 
 def quoted(path: Path) -> str:
-    """A path as a shell takes it, for a command to be copied."""
+    """A path quoted for the shell."""
     return shlex.quote(str(path))
 
 
 def looked_at(path: Path) -> str:
-    """A path that is not there, for a sentence: with the folder from which a relative one is seen."""
+    """A missing path, for a message: a relative one with the folder that it is relative to."""
     return str(path) if path.is_absolute() else f"{path} in {Path.cwd()}, from where the path is seen"
 
 
 def say(text: str, style: str = "") -> None:
-    """Prints text as it is: names may hold brackets, and no line is broken, so that commands can be copied."""
+    """Prints text without markup or line breaks, so that brackets are kept and commands can be copied."""
     CONSOLE.print(text, style=style, soft_wrap=True, highlight=False, markup=False)
 
 

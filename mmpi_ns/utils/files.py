@@ -34,7 +34,7 @@ def opened(name: Path) -> Iterator[Image.Image]:
 
 def write_atomically(path: Path, write: Callable[[Path], object], folder: Path | None = None) -> None:
     """Calls ``write`` with a temporary path on the same disk, in ``folder`` or beside the finished file, and renames
-    that; removes it when writing fails. Raises WriteError, which says why and what is left."""
+    it; removes it if writing fails. Raises WriteError with the reason and the free space."""
     temporary = (folder or path.parent) / f".{path.name}.{os.getpid()}.tmp"
     try:
         write(temporary)
@@ -57,8 +57,8 @@ def write_atomically(path: Path, write: Callable[[Path], object], folder: Path |
 def whole(path: Path) -> Iterator[Path]:
     """A temporary path to write to, which replaces the file at the end, so that the file is complete or absent.
 
-    For one of many files that are made again after an interruption: it says nothing of errors and does not wait for the
-    disk, as ``write_atomically`` does.
+    For one of many files that are made again after an interruption: unlike ``write_atomically`` it neither translates
+    errors nor waits for the disk.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
@@ -92,13 +92,13 @@ def make_writable(folder: Path, option: str) -> None:
 
 
 def cache_folder() -> Path:
-    """``$XDG_CACHE_HOME/mmpi_ns``, by default in ``~/.cache``: what was computed, compiled or tried is remembered."""
+    """``$XDG_CACHE_HOME/mmpi_ns``, by default in ``~/.cache``: the cache of computed and compiled results."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
 
 
 def to_bytes(text: str) -> UInt8[Tensor, "B"]:
     """Text as a buffer of a module."""
-    import torch  # takes seconds, and most who write files need none of it
+    import torch  # takes seconds, and most callers do not need it
 
     return torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
 

@@ -1,4 +1,4 @@
-"""Signals, and what the C library does with freed memory: changes of the process that undo themselves."""
+"""Signals and settings of malloc: temporary changes of the process."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from threading import current_thread, main_thread
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 """Of mallopt, in malloc.h."""
 KEPT = 256 << 20
-"""Freed bytes that are kept for the next use: more than a step takes beside the tables."""
+"""Freed bytes that malloc keeps: more than a step takes beside the tables."""
 OWN_MAPPING = 32 << 20
-"""Bytes from which an array, such as a table, goes back to the system at once: glibc's upper limit."""
+"""Size from which a freed array is returned to the system at once: glibc's upper limit."""
 MALLOC_DEFAULT = 128 << 10
 """glibc's value of both thresholds at the start."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -24,9 +24,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @contextmanager
 def keep_freed_memory() -> Iterator[None]:
-    """glibc's malloc: a training step takes again what the last one freed. Its defaults give much of it back to the
-    system, which then hands out zeroed pages: thousands of page faults a step. glibc adapts its defaults and cannot be
-    asked for them, so the undo restores where they begin. Other C libraries are left as they are."""
+    """Within the block, glibc's malloc reuses the memory that the last training step freed. Its defaults return much of
+    it to the system, which then supplies zeroed pages: thousands of page faults a step. glibc adapts its defaults and
+    does not report them, so the initial ones are restored. Other C libraries are not changed."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
@@ -48,7 +48,7 @@ def give_back_freed_memory() -> None:
 
 
 def discard(output: int) -> None:
-    """Whatever is written to stdout (1) or stderr (2) from now on, or waits to be, goes nowhere."""
+    """Discards further and buffered output to stdout (1) or stderr (2)."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), output)
 
 

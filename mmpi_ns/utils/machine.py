@@ -17,7 +17,7 @@ NVIDIA = Path("/proc/driver/nvidia")
 DRIVERS = {13: 580, 12: 525, 11: 450}
 """Series of NVIDIA's driver that a major version of CUDA needs at least."""
 WHEELS = {12: "cu126", 11: "cu118"}
-"""Builds of torch for CUDA versions that older drivers know."""
+"""Builds of torch for CUDA versions of older drivers."""
 
 
 def free_memory(device: str | torch.device) -> int:
@@ -67,8 +67,8 @@ def _idle_ticks() -> int:
 
 
 def unused_gpu() -> str:
-    """Why torch does not use an NVIDIA GPU that the system has, with the command that mends it; empty where it does,
-    where there is none, and where CUDA_VISIBLE_DEVICES hides it."""
+    """Reason why torch does not use an NVIDIA GPU of the system, with the command to fix it; empty if it does, if there
+    is none, and if CUDA_VISIBLE_DEVICES hides it."""
     if torch.cuda.is_available() or os.environ.get("CUDA_VISIBLE_DEVICES") is not None:
         return ""
     try:

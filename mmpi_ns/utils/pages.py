@@ -13,7 +13,7 @@ from torch import Tensor
 FORGET, LARGE_PAGES = 4, 14
 """Of madvise, in linux/mman.h: MADV_DONTNEED gives memory back, and the values are lost; MADV_HUGEPAGE."""
 PART = 1 << 20
-"""Numbers that are looked at together."""
+"""Number of elements compared at once."""
 
 
 def lazy_zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -35,14 +35,14 @@ def empty_table(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
 
 
 def all_zero(array: Tensor) -> bool:
-    """Whether an array has no other value, as the reliability of joint training: ends at the first part that has, and
-    without a mark for every number, which ``any`` makes."""
+    """Whether all elements are 0, as for reliability in joint training: stops at the first part that has another value,
+    without the mask of ``any``."""
     return not any(bool(part.any()) for part in array.reshape(-1).split(PART))
 
 
 def advise(array: Tensor, advice: int) -> None:
-    """madvise for the whole pages of a contiguous array, or of a part of one, on a CPU. What a system does not follow
-    changes nothing."""
+    """madvise for the whole pages of a contiguous array, or of a part of one, on a CPU. Ignored by systems without
+    it."""
     if array.device.type != "cpu" or sys.platform != "linux":
         return
     start, page = array.data_ptr(), mmap.PAGESIZE

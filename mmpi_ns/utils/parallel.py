@@ -23,13 +23,13 @@ _entering = Lock()
 
 
 def num_threads() -> int:
-    """Threads that share the work of this package: as many as torch uses, or used before ``torch_apart``."""
+    """Number of threads of this package: that of torch, before ``torch_apart``."""
     return _outer[0] if _outer else torch.get_num_threads()
 
 
 @contextmanager
 def torch_apart() -> Iterator[None]:
-    """Within the block torch's own operations take one thread, and ``num_threads`` stays what it was.
+    """Within the block torch's operations use one thread, and ``num_threads`` does not change.
 
     OpenMP's threads wait for torch's next operation spinning, for milliseconds, on the cores that the compiled kernels
     of this package would use. The arrays of a training step and of a picture are too small for torch's threads to pay.
@@ -50,7 +50,7 @@ def torch_apart() -> Iterator[None]:
 def one_thread_each() -> Iterator[None]:
     """Within the block torch, OpenCV and the BLAS of NumPy work in the calling thread, for work shared out by images.
 
-    Their results are then the same at each start, and no library's threads spin on the cores of the others.
+    Results are then reproducible, and no library's threads spin on the cores of the others.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)

@@ -20,16 +20,17 @@ def _key(seed: int, step: int, purpose: str) -> int:
 
 @dataclass(eq=False)
 class Generators:
-    """The streams of ``generator``, from one object for each purpose: what a CUDA graph can draw from again and again.
+    """The streams of ``generator``, from one object for each purpose, so that a CUDA graph can draw from them
+    repeatedly.
 
-    A generator that a graph is recorded with is seeded by ``start`` before each step that the graph repeats.
+    The generators of a graph are seeded by ``start`` before each replay.
     """
 
     seed: int
     device: str | torch.device
     held: dict[str, torch.Generator] = field(default_factory=dict)
     recording: bool = False
-    """Whether steps are recorded, not drawn: nothing is seeded then."""
+    """Whether steps are being recorded: generators are not seeded then."""
 
     def of(self, step: int, purpose: str) -> torch.Generator:
         """The stream of a step and a purpose, from its start."""
