@@ -15,7 +15,7 @@ __all__ = ["CameraPath", "Images", "Scene", "load", "render"]
 
 
 def __getattr__(name: str) -> Any:
-    """One of the functions above, imported when it is first asked for: torch and nerfstudio take seconds."""
+    """One of the functions above, imported when it is first accessed: torch and nerfstudio take seconds."""
     if name not in __all__:
         raise AttributeError(f"module 'mmpi_ns' has no attribute '{name}'")
     from mmpi_ns import functional

@@ -1,7 +1,7 @@
 """Trained scenes as functions: ``load`` a run, ``render`` images from any pinhole cameras.
 
-``mmpi_show.load`` reads baked scenes. None needs the images of the capture, nor nerfstudio's classes at hand.
-README.md has an example.
+``mmpi_show.load`` reads baked scenes. Neither needs the images of the capture or nerfstudio's classes. Examples:
+docs/export.md.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class CameraPath:
 
     @staticmethod
     def of(rows: Float[Tensor, "N 18"]) -> CameraPath:
-        """From rows of a pose [3, 4], focal lengths, principal point, width and height."""
+        """The path of rows with a pose [3, 4], focal lengths, principal point, width and height."""
         intrinsics = torch.eye(3).repeat(len(rows), 1, 1)
         intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]] = rows[:, 12:16]
         return CameraPath(rows[:, :12].view(-1, 3, 4), intrinsics, rows[:, 16:].long())
@@ -76,15 +76,14 @@ class Images:
 
 
 def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
-    """A run of ns-train, rendered exactly, as ns-eval renders it, from its last checkpoint, without the images of the
-    capture.
+    """A run of ns-train at its last checkpoint, rendered exactly as by ns-eval, without the images of the capture.
 
     Args:
         path: a run's folder or its config.yml.
         device: where images are rendered; by default a GPU if there is one.
 
     Raises:
-        InputError: there is no run, or its files are damaged (says which, and what to do).
+        InputError: there is no run, or its files are damaged; the message names the file and the remedy.
     """
     path = Path(path)
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
@@ -109,8 +108,8 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
 
 
 def read_run_config(path: Path) -> MMPIModelConfig:
-    """The model's settings in a run's config.yml. Raises InputError if ns-train did not write it, trained another
-    method, or an earlier version did with an option that left."""
+    """The model's settings in a run's config.yml. Raises InputError if ns-train did not write it, or if it is of
+    another method or an incompatible version."""
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -146,7 +145,7 @@ def render(
         Images [*N, H, W, .] on the scene's device; [H, W, .] for one pose [3, 4].
 
     Raises:
-        InputError: a shape or a number is wrong (says which).
+        InputError: a shape or a number is wrong.
     """
     for name, size in (("width", width), ("height", height)):
         check_number(f"The {name} of images", size, Number(1, whole=True))

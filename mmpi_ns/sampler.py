@@ -1,10 +1,10 @@
-"""Sample and merge: each ray is sampled in every head's own NDC, the samples are merged by distance (paper sec. III-B).
+"""Sample and merge: each ray is sampled in every head's NDC, and the samples are merged by distance (paper sec. III-B).
 
-What happens to a ray: its crossings with all planes, in closed form (``crossings``); a sample at each, placed by
-its head (``_live_samples``); all of them in order of distance (``merge``); and of these the ones that matter
-(``prune``). ``march`` does all four. It has no gradients: the field differentiates through the samples that are kept.
+The steps for a ray: its intersections with all planes, in closed form (``crossings``); a sample at each, in the NDC of
+its head (``_live_samples``); all samples in order of distance (``merge``); and the ones with enough weight (``prune``).
+``march`` does all four without gradients: the field differentiates through the kept samples.
 
-Here is the definition in plain torch. C++ and Triton stand behind it (``ops/march``).
+This is the definition in plain torch; the C++ and Triton forms are in ``ops/march``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FAIR_SHARE = 0.1
 BLEND_BLOCK = 16
 """Samples of a ray between two checks whether it is already opaque."""
 OPAQUE_DEPTH = 9.2
-"""exp(-9.2) = 1e-4 of the light: far below the weight of a kept sample."""
+"""Optical depth of an opaque ray: its transmittance, 1e-4, is far below the weight of a kept sample."""
 
 
 @dataclass
@@ -75,7 +75,7 @@ class LiveSamples(NamedTuple):
 
 @operation("gpu", kernels="mmpi_ns.ops.march")
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
-    """The samples of each ray that matter.
+    """Merged samples of each ray, with enough weight to be kept.
 
     Args:
         layout: the scene.
@@ -92,9 +92,9 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     if options.blends and tau.numel():
         local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
         tau = flat.tau.clone()
-        # Front to back until a ray lets less than exp(-OPAQUE_DEPTH) through. Reliability costs a lookup in every head,
-        # and most samples lie behind the first surface: those keep their own depth, which changes weights by less than
-        # that. Samples too thin to matter get an equal share without one.
+        # Front to back until the transmittance of a ray is below exp(-OPAQUE_DEPTH). Reliability costs a lookup in
+        # every head, and most samples lie behind the first surface: those keep their unblended depth, which changes
+        # weights by less than that. Samples too thin to matter get an equal share without one.
         passed = tau.new_zeros(order.shape[0])
         for start in range(0, order.shape[1], BLEND_BLOCK):
             block = order[:, start : start + BLEND_BLOCK]
@@ -122,10 +122,10 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
 def show_rays(
     layout: SceneLayout, tables: Tables, features: Float[Tensor, "T C"], rays: Rays, options: MarchOptions
 ) -> Shown:
-    """What rays gather of colours and features, how much light they let through, and where: pictures, in one pass.
+    """Sums of colours and features along rays, transmittance and depth: images, in one pass.
 
-    On a GPU nothing is waited for. The compiled form on a CPU takes sixteen rays abreast and passes over tiles that are
-    not stored, also where the threshold is 0.
+    On a GPU without synchronisation. The compiled form on a CPU processes sixteen rays at a time and skips empty tiles,
+    even with a threshold of 0.
 
     Args:
         layout: the scene.
@@ -154,11 +154,11 @@ def show_rays(
 def crossings(
     layout: SceneLayout, rays: Rays, hits: PlaneHits
 ) -> tuple[Int[Tensor, "R H"], Int[Tensor, "R H"], Bool[Tensor, "R 1"]]:
-    """The live samples of rays in the heads that may answer them, from their crossings with all planes.
+    """The samples of rays in the heads that may render them, from their intersections with all planes.
 
     Returns:
-        m of each head's nearest live plane (of the cube, which comes last, its first sample), how many live samples
-        each head has, and ``MergedSamples.explained``.
+        m of each head's nearest intersected plane (of the cube, which comes last, its first sample), number of samples
+        of each head, and ``MergedSamples.explained``.
     """
     first, counts = hits.m_first, hits.count
     if rays.priorities is not None:
@@ -172,8 +172,9 @@ def crossings(
         counts = torch.where(rays.heads, counts, torch.zeros_like(counts))
     explained = (counts > 0).any(-1, keepdim=True)
     if rays.heads is not None or rays.priorities is not None:
-        # Some head covers the ray out to infinity, and the first one is entered before the first content. One plane
-        # before the first live one bounds the entry: behind the camera means that the ray starts inside.
+        # Fully covered: some head contains the ray out to infinity, and the first head is entered before the first
+        # content. The plane before the first intersected one bounds the entry; if it lies behind the camera, the ray
+        # starts inside.
         live, frames = counts[:, : len(layout.mpis)] > 0, layout.frames
         m_before = torch.minimum(hits.m_first + 1, frames.num_planes - 1)
         w = sample_disparity(m_before, frames.disparity_steps, frames.last_disparities)
@@ -197,7 +198,7 @@ def _live_samples(
     first: Int[Tensor, "R H"],
     counts: Int[Tensor, "R H"],
 ) -> LiveSamples:
-    """All live planes of every MPI, and the samples inside the cube, at fixed distances from each camera."""
+    """Samples on all intersected planes of every MPI, and inside the cube at fixed distances from each camera."""
     parts = []
     for head in heads_of(layout):
         k = head.number

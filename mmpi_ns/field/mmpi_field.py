@@ -119,8 +119,7 @@ class MMPIField(TexelTables):
 
         All planes start at equal rendering weight 1/L: biases b_l give alpha_l = 1 / (L - l), the last one clamped, by
         alpha = 1 - exp(-softplus(b) 256 / L). An MPI with a finite far starts like one to infinity without its last
-        planes, whose share of the weight is left to content behind it. Source: DVGO v2's MPI; docs/how_it_works.md,
-        "Density".
+        planes, whose weight goes to content behind it. Source: DVGO v2's MPI; docs/how_it_works.md, "Density".
         """
         if (layout := self.cached("layout")) is not None:
             return layout
@@ -141,12 +140,12 @@ class MMPIField(TexelTables):
 
     @property
     def tables(self) -> Tables:
-        """What the march reads."""
+        """Tables for the march."""
         return Tables(self.density.data, self.reliability.data, self.touched)
 
     @property
     def blends(self) -> bool:
-        """Whether heads are blended by reliability where several cover a point. One has nothing to blend with."""
+        """Whether heads are blended by reliability where several cover a point; False for a single head."""
         return self.learns_reliability and self.plan.num_heads > 1
 
     @property
@@ -160,17 +159,16 @@ class MMPIField(TexelTables):
         """Densities, and mean colours and features, at the positions of any samples.
 
         A plane has an optical depth and no thickness. A density is that depth over the distance to the next plane along
-        the head's axis (``MPIHead.density``), so its integral through a head in that direction is the optical depth
-        that the head's planes have there. Heads that cover a point add up, each by its share: alpha becomes P alpha
-        (paper sec. III-C), and in the limit of thin samples tau becomes P tau. Without reliability all shares are 1, as
-        in rendering.
+        the head's axis (``MPIHead.density``), so its integral through a head in that direction is the optical depth of
+        the head's planes. Heads that cover a point add up, each by its share: alpha becomes P alpha (paper sec. III-C),
+        and in the limit of thin samples tau becomes P tau. Without reliability all shares are 1, as in rendering.
 
         Args:
-            ray_samples: whose ``frustums.get_positions()`` are asked for, world axes.
+            ray_samples: with ``frustums.get_positions()`` in world axes.
 
         Returns:
-            1 / scene units, 0 where no head is; and what the texels hold there, weighted by the density of each head,
-            0 where there is none.
+            Densities, 1 / scene units, 0 outside all heads; and colours and features, weighted by the density of each
+            head, 0 outside all heads.
         """
         positions = ray_samples.frustums.get_positions()
         points, heads = positions.reshape(-1, 3), heads_of(self.layout)
@@ -196,7 +194,7 @@ class MMPIField(TexelTables):
     ) -> dict[FieldHeadNames, Float[Tensor, "*batch 3"]]:
         """Colours at the positions of any samples, of the texels that ``get_density`` reads there.
 
-        A network for every sample has a view of its own in each head; here the texels' diffuse colour answers.
+        With a network for every sample, whose input differs by head, the texels' diffuse colour is returned.
 
         Args:
             ray_samples: positions and directions, world axes.
@@ -215,7 +213,7 @@ class MMPIField(TexelTables):
     # Merged samples ----------------------------------------------------------------------------------------------
 
     def optical_depths(self, rays: RayBundle, samples: MergedSamples) -> tuple[Float[Tensor, "R S"], Lookup]:
-        """Optical depth of each valid sample (0 in empty slots), and where the lookups went.
+        """Optical depth of each valid sample (0 in empty slots), and the lookups.
 
         A density times an interval: on a plane there is no interval, so the product itself is learned.
         """
@@ -244,7 +242,7 @@ class MMPIField(TexelTables):
             parts.append(texel_rows(self.layout, heads[:in_mpis], planes[:in_mpis], ndc[:in_mpis]))
         if in_mpis < len(index):
             parts.append(self.grids[-1].trilinear(ndc[in_mpis:]))
-        if room is not None:  # what no sample fills reads the empty brick
+        if room is not None:  # unused slots read the empty brick
             filled = samples.valid.reshape(-1)[index].split([len(rows) for rows, _ in parts])
             empty = torch.arange(len(index), device=index.device).remainder(BRICK).split([len(x) for x in filled])
             columns = zip(filled, parts, empty, strict=True)
@@ -268,7 +266,7 @@ class MMPIField(TexelTables):
         Args:
             rays: of the samples.
             samples: of the rays.
-            lookup: where they read the tables; None looks them up where gradients are asked for.
+            lookup: of the samples in the tables; None computes it if gradients are enabled.
             chosen: as for ``render_colors``.
         """
         directions, axes = rays.directions, self.layout.frames.axes
@@ -285,7 +283,7 @@ class MMPIField(TexelTables):
         for k, here, part in lookup.by_head(lookup.read(lookup.features)):
             index = lookup.index[here]
             of_samples = (part, lookup.ndc[here], index // lookup.shape[1], index)
-            if chosen is not None and not on_gpu(chosen):  # a GPU would be waited for
+            if chosen is not None and not on_gpu(chosen):  # a GPU would synchronise
                 kept = chosen[of_samples[2]].nonzero()[:, 0]
                 of_samples = tuple(x.index_select(0, kept) for x in of_samples)
             values, ndc, numbers, index = of_samples
@@ -306,9 +304,9 @@ class MMPIField(TexelTables):
         Args:
             rays: of the samples.
             samples: of the rays.
-            lookup: where they read the tables; None without gradients.
+            lookup: of the samples in the tables; None without gradients.
             composite: weights of the samples.
-            chosen: rays whose colours are needed; others may be left out to save time. None for all.
+            chosen: rays whose colours are needed; others may be skipped. None for all.
         """
         if not isinstance(self.networks, RayShader):
             colors, weights = self.sample_colors(rays, samples, lookup, chosen), composite.weights.detach()[..., None]
@@ -332,7 +330,7 @@ class MMPIField(TexelTables):
             lookup: of the batch.
             density_weight: of densities.
             feature_weight: of colours and features.
-            chroma_times: how many times more than they already do differences of chroma count in the gradient.
+            chroma_times: additional weight of differences of chroma in the gradient.
         """
         total = self.density.new_zeros(())
         if (scales := self.cached("resolution")) is None:
@@ -351,7 +349,7 @@ class MMPIField(TexelTables):
 
     def sample_shares(self, rays: RayBundle, samples: MergedSamples, lookup: Lookup) -> tuple[Tensor, Tensor]:
         """log P and log(1 - P) of the valid samples of rays, with gradients to the reliability."""
-        # Shares do not move with poses.
+        # Shares have no gradients to poses.
         local = geometry.LocalRays.of(rays.origins.detach(), rays.directions.detach(), self.layout.frames)
         places = (lookup.index // lookup.shape[1], local, samples.inverse_t.reshape(-1)[lookup.index], lookup.heads)
         return log_shares(self.layout, self.reliability, self.touched, *places)
@@ -369,16 +367,16 @@ def moving(
 ) -> Float[Tensor, "N 3"]:
     """The positions of samples, bit for bit unchanged, with gradients to the rays.
 
-    The march has no gradients. A sample stays on its plane, so it moves within that plane when its ray moves:
-    u(w) = dx/dz + w (ox - oz dx/dz) at the plane's disparity w, and likewise v. Depths of planes, which planes a ray
-    meets and which samples are kept are held fixed; a sample of the cube moves with the point at its distance.
+    The march has no gradients. A sample stays on its plane, so it moves within that plane when its ray moves: u(w) =
+    dx/dz + w (ox - oz dx/dz) at the plane's disparity w, and likewise v. Depths of planes, intersected planes and kept
+    samples are held fixed; a sample of the cube moves with the point at its distance.
 
     Args:
         layout: of the scene.
         origins: of the rays, world axes.
         directions: likewise, unit.
         rays: ray of each sample.
-        heads: of each sample, rising: those of the cube come last.
+        heads: of each sample, ascending; those of the cube come last.
         planes: of each sample.
         inverse_t: inverse distances of the samples.
         ndc: their positions.
@@ -387,7 +385,7 @@ def moving(
     frames, mpis = layout.frames, heads[:count]
     local = LocalRays.of(origins, directions, frames)
     o, d = local.local_origins, local.local_directions
-    facing = d[..., 2:] > FACING_EPS  # where it is not there are no samples
+    facing = d[..., 2:] > FACING_EPS  # elsewhere there are no samples
     slope = d[..., :2] / torch.where(facing, d[..., 2:], 1)
     bend = o[..., :2] - o[..., 2:] * slope
     line = torch.cat([slope, bend], -1).flatten(0, 1).index_select(0, rays[:count] * len(layout.mpis) + mpis)

@@ -1,7 +1,7 @@
 """Networks and shading: the colour of a ray from the texels along it.
 
 ``ray``: a texel stores a diffuse colour and features for view dependence; both are composited along the ray, and one
-network shades the ray once. ``sample``: a network gives every sample its colour (the paper, eq. for MLP^(rgb)).
+network shades the ray once. ``sample``: a network gives every sample its colour (paper, eq. 7 and 10).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Shading = Literal["ray", "sample"]
 CHANGE = 4.0
 """Change of the log odds of a colour for each unit of network output: a middle grey then changes by one unit."""
 MOST_CHANGE = 8.0
-"""Bound of that change."""
+"""Maximum of that change."""
 LEAST_MASS = 1e-6
 """Rays with less accumulated weight are almost invisible, whatever their colour."""
 
@@ -51,7 +51,7 @@ class Networks(nn.Module):
         self.resize(count)
 
     def resize(self, count: int) -> None:
-        """Starts ``count`` networks anew, equal ones, with PyTorch's default initialisation from a fixed seed."""
+        """Initialises ``count`` equal networks, with PyTorch's default initialisation from a fixed seed."""
         generator = torch.Generator().manual_seed(0)
         parts = []
         for fan_in, shape in zip((s[-1] for s in self.shapes[::2] for _ in range(2)), self.shapes, strict=True):

@@ -1,4 +1,4 @@
-"""nerfstudio's pipeline, whose evaluation also prints its figures."""
+"""nerfstudio's pipeline, with printed evaluation scores."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mmpi_ns.utils.errors import say
 from mmpi_ns.utils.random_draws import generator
 
 REFINED = "refined_"
-"""Prefix of metrics of images whose own poses were refined against the model."""
+"""Prefix of metrics of images whose poses were refined against the model."""
 STEPS = 80
 """Optimisation steps for each image."""
 RAYS = 1024
@@ -43,7 +43,7 @@ class MMPIPipelineConfig(VanillaPipelineConfig):
 
 
 class MMPIPipeline(VanillaPipeline):
-    """Scores images at their own exposure, and prints PSNR and SSIM with the worst and the best of them."""
+    """Pipeline that scores images at their exposure, and prints mean, worst and best PSNR and SSIM."""
 
     config: MMPIPipelineConfig
 
@@ -93,7 +93,7 @@ class MMPIPipeline(VanillaPipeline):
 
         Args:
             camera: of the image.
-            batch: the image, as the data set gives it, with ``image_idx`` in it.
+            batch: the image, from the data set, with ``image_idx``.
         """
         model: Any = self.model
         outputs, observed = self.outputs_of(camera, batch)
@@ -108,14 +108,14 @@ class MMPIPipeline(VanillaPipeline):
         return values, images
 
     def outputs_of(self, camera: Cameras, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
-        """The rendering of an image at its own exposure, and its colours [H, W, 3]: what every score compares."""
+        """The rendering of an image at its exposure, and its colours [H, W, 3], for all scores."""
         model: Any = self.model
         observed = model.observed(batch)
         outputs = model.get_outputs_for_camera(camera.to(model.device))
         return self.as_exposed(camera, outputs, observed), observed
 
     def as_exposed(self, camera: Cameras, outputs: dict[str, Tensor], observed: Tensor) -> dict[str, Tensor]:
-        """The outputs at the exposure of the evaluated image itself, where exposures differ."""
+        """The outputs at the exposure of the evaluated image, if exposures differ."""
         model: Any = self.model
         if "radiance" not in outputs:
             return outputs
@@ -132,7 +132,7 @@ class MMPIPipeline(VanillaPipeline):
 
 
 def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:
-    """A camera moved to the pose from which a frozen model renders its image best.
+    """A camera refined to the pose from which a frozen model renders its image best.
 
     If the training poses were wrong, or were refined, the model does not match the test poses exactly. The pose is
     optimised by the colours of the same pixels that are then scored, so this is no score of view synthesis.
@@ -144,7 +144,7 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
         seed: of the draw of pixels.
 
     Returns:
-        The moved camera, its rotation in degrees, and its translation in scene units.
+        The refined camera, its rotation in degrees, and its translation in scene units.
     """
     moves: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=model.device)
     optimizer = torch.optim.Adam(moves.parameters(), lr=RATES[0])

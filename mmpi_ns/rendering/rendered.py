@@ -108,7 +108,7 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
 
 
 def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, first_head: int) -> dict[str, Tensor]:
-    """What is told of the heads with the most weight in each ray.
+    """Outputs about the heads with the most weight on each ray.
 
     Args:
         outputs: of one window; heads are counted as in the field.
@@ -118,8 +118,8 @@ def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, fir
 
     Returns:
         ``winning_mpi``: their numbers among all windows, where a finer copy has that of its MPI. ``texel_pixels``: the
-        pixels that one of their texels spans along its longer side at the depth of the ray; 0 where less than half of
-        the light is stopped.
+            pixels that one of their texels spans along its longer side at the depth of the ray; 0 where the
+            accumulation is below a half.
     """
     heads, plan, frames = outputs["winning_mpi"][:, 0].long(), field.plan, field.layout.frames
     mpi = heads.clamp(max=len(plan.mpis) - 1)
@@ -165,7 +165,7 @@ def render_rays(
             blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares)
             tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
     composite = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
-    # Keypoint rays, whose points have a known depth and no pixel, are supervised in depth alone: no colours for them.
+    # Keypoint rays, whose points have a depth and no pixel, are supervised in depth alone and need no colours.
     keypoints = bundle.keypoint_disparities if isinstance(bundle, TrainingRays) and lookup is not None else None
     chosen = None if keypoints is None else keypoints[:, 0] == 0
     rgb, sums = field.render_colors(bundle, samples, lookup, composite, chosen)

@@ -1,4 +1,4 @@
-"""``mmpi-bench``: scores anybody's renderings, and checks and times the kernels on a GPU."""
+"""``mmpi-bench``: scores renderings of any program, and checks and times the kernels on a GPU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ COMMANDS = {
         "Every kernel of this machine's GPU against plain torch, and the time of a step and a frame.",
     ),
 }
-"""Module that holds the command, as a class of its name, and what it does. Only the requested one is imported."""
+"""Module of each command, with a class of its name, and description. Only the requested one is imported."""
 
 
 def entrypoint() -> None:

@@ -1,4 +1,4 @@
-"""``mmpi-plan``: shows where MPIs would be placed in a scene, and why."""
+"""``mmpi-plan``: draws and explains the placement of the MPIs in a scene."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class PlanCommand:
         if not self.scene.exists():
             raise InputError(f"There is no scene at {looked_at(self.scene)}: check the path.")
         make_writable(self.output, "--output")
-        # Before the images are read, so that an error in it is reported at once.
+        # Before the images are read, so that an error in the plan is reported at once.
         windows = None if self.plan_file is None else WindowedPlan.load(self.plan_file)
         plan, table = self.output / "plan.json", self.output / "plan.md"
         if plan.is_file() and not (table.is_file() and _mark(plan) in table.read_text("utf-8", errors="replace")):
@@ -138,8 +138,8 @@ def load_observations(
         config.dataparser = ColmapDataParserConfig(colmap_path=config.priors.sfm_path)
     config.data = config.dataparser.data = data
     config.dataparser.downscale_factor = downscale_factor
-    # As ns-train does, so that it refuses what ns-train would refuse, and finds the depths that it would find.
-    config.priors = replace(config.priors, correct_exposure=False)  # placement does not ask for it
+    # As ns-train does, with the same refusals and depth priors.
+    config.priors = replace(config.priors, correct_exposure=False)  # placement does not use it
     config.new_view_share = 0.0
     manager = config.setup(device="cpu", test_mode="inference")
     if not any(Path(file).is_file() for file in manager.train_dataset.image_filenames):

@@ -1,4 +1,4 @@
-"""Folder of a run: its lock, its plan and its checkpoints, from which only a run of the same capture can resume."""
+"""Folder of a run: lock, plan and checkpoints, from which only a run of the same capture can resume."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def last_checkpoint(folder: Path) -> Path:
 
 
 def checkpoint_to_load(config: TrainerConfig) -> Path | None:
-    """The checkpoint that a run resumes from; None for a new run. Raises InputError if it is not there."""
+    """The checkpoint that a run resumes from; None for a new run. Raises InputError if it is missing."""
     path = config.load_checkpoint
     if path is not None:
         if not path.is_file():
@@ -129,8 +129,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def states_of(pipeline: nn.Module, optimizers: Mapping[str, Optimizer], goes_on: bool) -> dict[str, Any]:
-    """The states of a pipeline and its optimisers for a file. After the last step nobody needs the moments, which are
-    half of all, nor more digits than images show."""
+    """States of a pipeline and its optimisers for a file. The last one has no moments, which are half of all bytes, and
+    tables in half precision."""
     state = pipeline.state_dict() if goes_on else in_half_precision(pipeline.state_dict())
     # A tensor of zeros alone, as untrained reliability, takes one number.
     zeros = {k: v.new_zeros(()).expand(v.shape) for k, v in state.items() if v.numel() > 1 and all_zero(v)}
@@ -140,7 +140,7 @@ def states_of(pipeline: nn.Module, optimizers: Mapping[str, Optimizer], goes_on:
 
 
 def cameras_in_short(observations: Observations) -> Float[Tensor, "M 18"]:
-    """Poses, intrinsics and sizes of the training cameras, which identify a capture wherever its files are."""
+    """Poses, intrinsics and sizes of the training cameras, which identify a capture."""
     poses = observations.camera_to_worlds.reshape(-1, 12)
     return torch.from_numpy(np.concatenate([poses, observations.intrinsics, observations.sizes], -1)).float()
 

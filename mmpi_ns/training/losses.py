@@ -1,6 +1,6 @@
-"""The losses: each a small pure function, and their weighted sum for a training batch (paper sec. III-E, SfM depth).
+"""The losses: each a small pure function, and their weighted sum for a training batch (paper sec. III-E, and depth).
 
-Weights and normalisations: docs/how_it_works.md. Total variation is computed on the tables (``ops/variation.py``).
+Weights and normalisations: docs/how_it_works.md. Total variation is computed on the tables (``ops/variation``).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from mmpi_ns.rendering.rendered import RenderedRays
 CLIPPED = 0.98
 """Colour of an image above which a channel may be clipped."""
 PLANE_ERROR = 0.6
-"""Minimum error of a known depth, in spacings of the densest planes."""
+"""Minimum error of a depth prior, in spacings of the densest planes."""
 TV_EVERY = 4
 """Total variation is added every this many steps, with its weight multiplied by the same number."""
 DEPTH_OUTLIERS = 0.02
-"""Likelihood of a known depth where a ray has no weight: the larger, the less influence false depths have."""
+"""Likelihood of a depth prior where a ray has no weight: the larger, the less influence outliers have."""
 KEYPOINT_WIDTH, KEYPOINT_OUTLIERS = 0.06, 1e-4
 """Standard deviation of the window round an SfM keypoint, relative to its inverse distance, and likelihood of a false
 one. Its mean is over the keypoint rays that can reach their point."""
@@ -61,8 +61,8 @@ def photometric(
     Args:
         predicted: colours of the field.
         observed: colours of the images divided by their exposures.
-        exposure: of each ray's image. Errors are those in the image, and where it is clipped the scene may be brighter.
-            None: all have the same.
+        exposure: of each ray's image. Errors are those in the image; where it is clipped, a brighter scene costs
+            nothing. None: all are equal.
     """
     error = predicted - observed
     if exposure is not None:
@@ -77,7 +77,7 @@ def point_color(
     second: Float[Tensor, "R 3"],
     observed: Float[Tensor, "R 3"],
 ) -> Float[Tensor, ""]:
-    """Each sample's own colour against its ray's, weighted by its rendering weight (L_pt_rgb; weights held fixed).
+    """Colour of each sample against its ray's, weighted by its rendering weight (L_pt_rgb; weights held fixed).
 
     sum_s w_s |c_s - o|^2, mean over rays, from the sums over each ray's samples of w, w c and w c^2.
     """
@@ -94,14 +94,14 @@ def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]
 def depth_priors(
     mass: Float[Tensor, "R"], reached: Bool[Tensor, "R"], outliers: float, count: Int[Tensor, ""] | int
 ) -> Float[Tensor, ""]:
-    """-log of the likelihood of known inverse distances given the weights along their rays, mean over ``count`` rays.
+    """-log of the likelihood of inverse distances given the weights along their rays, mean over ``count`` rays.
 
     A distance is either right, so that the weights lie within its error, exp(-1/2 ((q - q0) / error)^2), or an outlier,
     so that they may lie anywhere: -log(mass + outliers). The gradient is at most 1 / outliers, so a distance that many
-    views contradict is ignored. Rays without a sample near theirs tell nothing of it and add nothing.
+    views contradict is ignored. Rays without a sample near their distance add nothing.
 
     Args:
-        mass: weights round the known inverse distance (``ops.depth_sums``, the window its error).
+        mass: weights near the inverse distance (``ops.depth_sums``, the window its error).
         reached: rays with a sample near it.
         outliers: likelihood of an outlier.
         count: rays that the mean is over.
@@ -121,7 +121,7 @@ def batch_losses(
     """All losses of a training batch, each times its weight; and the squared colour error of each ray.
 
     Args:
-        rays: of ``TrainingRays``: pixel rays, then keypoint rays.
+        rays: rendered ``TrainingRays``: pixel rays, then keypoint rays.
         field: rendered for these rays.
         image: [P, 3 or 4] colours of the pixels.
         weight: of each loss.
@@ -141,7 +141,7 @@ def batch_losses(
     image = image.repeat(rays.times, 1)
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)
-    # If MPIs train separately and cover a ray only in part, they need not explain the remaining transmittance.
+    # If MPIs train separately and cover a ray only in part, the remaining transmittance is not penalised.
     background = torch.where(rays.samples.explained[pixels], random, observed)
     shown = (rays.rgb, rays.sums.mass, rays.sums.first, rays.sums.second, rays.composite.transmittance)
     colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in shown)
@@ -171,11 +171,11 @@ def batch_losses(
 
 
 def _depth_sums(rays: RenderedRays, told: TrainingRays, field: MMPIField) -> DepthSums:
-    """Of all rays; the target is a keypoint or the known depth of a pixel."""
+    """Depth sums of all rays; the target is a keypoint or the depth prior of a pixel."""
     samples, targets = rays.samples, told.disparities
     targets = told.origins.new_zeros(len(told), 2) if targets is None else targets
-    # The spacing of planes in inverse distance: a surface between two is represented by both. Of the densest ones, as
-    # an MPI of few planes may stand at a camera, for which they do.
+    # The spacing of planes in inverse distance: a surface between two is represented by both. Those of the densest MPI
+    # count: one with few planes may stand at a camera, where they suffice.
     spacings = [1 / (m.near * max(1, m.planes - 1)) for m in field.plan.mpis]
     least = PLANE_ERROR * min(spacings, default=0.0)
     targets = torch.stack([targets[:, 0], (targets[:, 1] ** 2 + least**2).sqrt().clamp(min=1e-12)], -1)

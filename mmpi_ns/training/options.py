@@ -1,4 +1,4 @@
-"""Options of a run, checked before anything is written; those of a config.yml, before they are used."""
+"""Checks of a run's options before anything is written, and of those of a config.yml before they are used."""
 
 from __future__ import annotations
 

@@ -15,12 +15,12 @@ from mmpi_ns.training.reliability import TRAINS, phase_lengths
 from mmpi_ns.utils.errors import InputError
 
 SOONER = 4
-"""Texels double so many times as early where depths are known, and surfaces need not form."""
+"""Factor by which texels double earlier with depth priors, as surfaces need not form."""
 GROWING_SHARE, FULL_STEPS = 0.5, 1250
-"""Share of the batch drawn while texels grow from known surfaces, when rays cost most and coarse texels need few. Runs
-of at most so many steps draw all, those in between as many in all as these (docs/ablations.md)."""
+"""Share of the batch drawn while texels grow from initial surfaces, when rays cost most and coarse texels need few.
+Runs of at most so many steps draw all; longer ones draw at least as many rays in total (docs/ablations.md)."""
 COPIES_FROM = 0.75
-"""Share of the time of high rates after which MPIs may get finer copies."""
+"""Share of the period of high learning rates after which MPIs may get finer copies."""
 
 
 @dataclass

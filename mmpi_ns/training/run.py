@@ -1,6 +1,6 @@
-"""State of a training run, and its changes between two steps: window, resolution, bricks, pixels, what trains.
+"""State of a training run, and its changes between two steps: window, resolution, bricks, pixels, frozen parameters.
 
-Also the rays of a batch, which move with the poses that are refined.
+Also the refined poses, with which the rays of a batch move.
 """
 
 from __future__ import annotations
@@ -39,16 +39,17 @@ WINDOWS_FOLDER = "windows"
 def keep_frame(
     moves: Float[Tensor, "M 6"], centers: Float[Tensor, "M 3"], distance: float, scale_is_free: bool
 ) -> None:
-    """Removes from pose corrections, in place, the motion of the whole capture that no training image shows (gauge).
+    """Removes from pose corrections, in place, the gauge: the motion of the whole capture that changes no training
+    image.
 
-    The scene would follow a rigid motion of all cameras, but test images keep their poses. Cameras that each turn by
-    the same angle where they stand are no rigid motion: images show that, and it stays. The motion is fitted by least
-    squares; what it leaves of the corrections shows the same images, to second order in the corrections.
+    The scene would follow a rigid motion of all cameras, but test images keep their poses. Cameras that each rotate in
+    place by the same angle are no rigid motion: that changes images, and is kept. The motion is fitted by least
+    squares; the remaining corrections give the same images, to second order in the corrections.
 
     Args:
         moves: shift in scene units and rotation vector of each camera, about the world's axes (nerfstudio's SO3xR3).
         centers: the cameras' positions before the corrections.
-        distance: of the content, by which a turn weighs as much as the shift of what is seen. Scene units.
+        distance: of the content, scene units; weights rotations by the shift of the content that they cause.
         scale_is_free: no depth measurement fixes the scale of the capture, so a change of scale is removed as well.
     """
     shifts, turns = moves.double().split(3, -1)
@@ -99,7 +100,7 @@ class Progress(nn.Module):
         self.register_buffer("window_number", torch.tensor(0))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Plan and schedule of a run come from its checkpoint, whatever config and capture say now."""
+        """Plan and schedule of a run come from its checkpoint, not from config and capture."""
         for name in ("windows_bytes", "schedule_bytes"):
             stored = state_dict.get(prefix + name)
             if stored is not None:  # nerfstudio loads the pipeline's own, empty state in a second pass
@@ -123,7 +124,7 @@ class PhaseSchedulerConfig(SchedulerConfig):
 
 
 class PhaseScheduler(Scheduler):
-    """Rates of the schedule that a run follows."""
+    """Learning rates of a run's schedule."""
 
     config: PhaseSchedulerConfig
 
@@ -133,7 +134,7 @@ class PhaseScheduler(Scheduler):
 
 
 def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:
-    """Training images whose rays the window renders."""
+    """Training images of a window."""
     if views is None:
         return None
     chosen = torch.from_numpy(cameras_of(window, views.origins.numpy()))
@@ -146,17 +147,17 @@ class TrainingRun:
 
     progress: Progress
     field: MMPIField
-    """Of the window that is trained, one after the other."""
+    """Field of the window being trained."""
     store: WindowStore
     """Finished windows."""
     views: TrainingViews | None
     """The training images; None: every texel is stored."""
     release_weight: float
-    """Bricks in which no sample has this weight are released."""
+    """Weight below which bricks are released."""
     poses: list[Parameter]
     """Corrections of the cameras' poses, if they are refined."""
     scale_is_free: bool
-    """No depth measurement fixes the scale of the capture."""
+    """Whether no depth measurement fixes the scale of the capture."""
     _drawn_from: int | None = None
 
     def parameters(self) -> dict[str, list[Parameter]]:

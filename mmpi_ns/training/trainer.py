@@ -96,7 +96,7 @@ class MMPITrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Prepares the run; a signal during this time ends it with a sentence."""
-        # Images are shared among threads; those of the libraries would only spin between small operations.
+        # Images are distributed among threads; those of the libraries would only spin between small operations.
         with signals_go_to(_end), one_thread_each():
             if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
                 torch.cuda.set_device(self.local_rank)
@@ -110,7 +110,7 @@ class MMPITrainer(Trainer):
             model_config.total_steps = config.max_num_iterations
             self._follows_capture = config.max_num_iterations == 0
             model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
-            # More rays a step on a large GPU, in as many fewer steps, where neither was asked for.
+            # More rays per step on a large GPU, in as many fewer steps, unless either is set.
             manager: Any = config.pipeline.datamanager
             on_gpu = str(self.device).startswith("cuda")
             if self._follows_capture and on_gpu and manager.train_num_rays_per_batch == RAYS:
@@ -135,7 +135,7 @@ class MMPITrainer(Trainer):
             self._announce(plan)
 
     def _repeats(self) -> bool:
-        """Whether steps can be graphs: on a GPU by its kernels, where nobody asks for more than the method does."""
+        """Whether steps can be CUDA graphs: on a GPU with its kernels, without options that need ordinary steps."""
         config, field = self.config, self._run.field
         return (
             config.graphs
@@ -191,7 +191,7 @@ class MMPITrainer(Trainer):
     def train(self) -> None:
         """Runs max-num-iterations in total (a window); nerfstudio 1.1.5 would run as many again after a resume."""
         if self._start_step >= self._total_steps:
-            # A finished run lacks its details where it was stopped meanwhile.
+            # A finished run lacks its details if it was interrupted.
             self._last_step = self._start_step - 1
             shows_details = cast(Any, self.pipeline.model).config.rendering.nearest_images
             is_last = self._start_step == self._total_steps
@@ -210,7 +210,7 @@ class MMPITrainer(Trainer):
         with signals_go_to(stop):
             self._train_until(self._total_steps)
         if self._stopped_by is not None:
-            self.config.logging.profiler = "none"  # nothing more is said
+            self.config.logging.profiler = "none"  # no further output
             path = checkpoints_in(self.checkpoint_dir).get(self._last_step)
             if path is None:  # training was paused
                 _end(self._stopped_by)
@@ -234,7 +234,7 @@ class MMPITrainer(Trainer):
             self.config.max_num_iterations = self._window_steps
 
     def kernels_differ(self) -> str:
-        """What the compiled operations compute otherwise than plain torch on a small batch of rays, in words."""
+        """Description of the differences between compiled operations and plain torch on a small batch of rays."""
         run, model, sources = self._run, cast(Any, self.pipeline.model), self._manager.sources
         assert sources is not None, "a step has drawn rays"
         progress, field = run.progress, run.field
@@ -263,7 +263,7 @@ class MMPITrainer(Trainer):
         self._last_step = step
         if self._log is not None:
             self._log.note(step, others[0]["rgb_loss"])
-        if self._stopped_by is not None:  # nerfstudio forgets what was said before its loop
+        if self._stopped_by is not None:  # nerfstudio ignores requests made before its loop
             self.stop_training = True
         run, progress = self._run, self._run.progress
         if len(progress.windows) > 1 and (step + 1) % progress.schedule.window_steps == 0:
@@ -286,7 +286,7 @@ class MMPITrainer(Trainer):
                 self._train_complete_viewer()
 
     def _complete(self) -> None:
-        """What follows the last step: details, a quick test and the next commands."""
+        """Work after the last step: details, a quick test and the next commands."""
         last, folder = checkpoints_in(self.checkpoint_dir).get(self._last_step), quoted(self.checkpoint_dir)
         end = (
             f"Stopped after the last step, which is in {last}: the same command with --load-dir {folder} makes details."
@@ -300,7 +300,7 @@ class MMPITrainer(Trainer):
         say(next_commands(self.base_dir))
 
     def _write_details(self, step: int) -> None:
-        """Keeps what the trained field lacks in its training images, if it is to be shown, as it is from now on."""
+        """Writes the details of the training images, if they are in use, and adds them to images from now on."""
         model: Any = self.pipeline.model
         if not model.config.rendering.nearest_images:
             return
