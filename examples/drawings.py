@@ -30,7 +30,7 @@ def draw_merging(path: Path) -> None:
     distances = _distances(mpis, origin, direction)
     figure = _figure(9.5, 6.2)
     axes = figure.add_subplot(3, 1, (1, 2), aspect="equal", xlabel="along the street, m", ylabel="to the left, m")
-    axes.set_title("Each ray crosses the planes of every MPI that faces it ...", fontsize=11)
+    axes.set_title("Each ray intersects the planes of every MPI that faces it ...", fontsize=11)
     axes.axhspan(-6, 6, color="0.93")
     axes.plot(np.arange(0, 41, 2.0), np.zeros(21), "k.", markersize=4, label="cameras")
     for mpi, t, color in zip(mpis, distances, COLORS, strict=True):
@@ -44,7 +44,7 @@ def draw_merging(path: Path) -> None:
     axes.set_ylim(-13, 19)
     axes.legend(loc="lower right", fontsize=8)
     below = figure.add_subplot(3, 1, 3, xscale="log", xlabel="distance along the ray, m")
-    below.set_title("... and the samples of all MPIs are put in order of distance", fontsize=11)
+    below.set_title("... and the samples of all MPIs are merged by distance", fontsize=11)
     for k, (t, color) in enumerate(zip(distances, COLORS, strict=True)):
         shown = np.where(np.isfinite(t), t, AT_INFINITY)
         below.plot(shown, np.full(len(t), 3 - k), "o", color=color, markersize=6)
@@ -59,7 +59,7 @@ def draw_merging(path: Path) -> None:
 
 
 def draw_reliability(path: Path) -> None:
-    """Two MPIs that know a wall, one of them with a ghost in front of it: weights without and with reliability."""
+    """Two MPIs with a wall, one of them also with a ghost in front of it: weights without and with reliability."""
     t = np.linspace(4, 13, 19)
     alpha = [0.8 * _bump(t, 10, 0.5), 0.7 * _bump(t, 10, 0.5) + 0.45 * _bump(t, 6.5, 0.6)]
     trust = [np.zeros_like(t), np.where(t < 8.3, -3.0, 0.0)]
@@ -76,14 +76,14 @@ def draw_reliability(path: Path) -> None:
     light = [100 * w[t < 8.3].sum() / w.sum() for w in weights]
     rows = [
         ("opacity α of the samples of two MPIs", np.stack(alpha, 1)),
-        ("reliability: the share P = softmax(R) that each is believed", share.exp().reshape(-1, 2).numpy()),
-        (f"weights if all are believed: the ghost has {light[0]:.0f} % of the colour", weights[0]),
+        ("relative reliability P = softmax(R)", share.exp().reshape(-1, 2).numpy()),
+        (f"weights without reliability: the ghost has {light[0]:.0f} % of the colour", weights[0]),
         (f"weights with α' = P α: the ghost has {light[1]:.0f} %", weights[1]),
     ]
     for k, (title, values) in enumerate(rows):
         axes = figure.add_subplot(2, 2, k + 1)
         axes.set_title(title, fontsize=10)
-        for j, name in enumerate(("MPI 1 knows a wall at 10 m", "MPI 2 has a ghost at 6.5 m as well")):
+        for j, name in enumerate(("MPI 1: wall at 10 m", "MPI 2: wall, and ghost at 6.5 m")):
             axes.bar(t + 0.21 * (j - 0.5), values[:, j], 0.2, color=COLORS[j], label=name)
         axes.set_ylim(0, 1 if k < 2 else 0.5)
         axes.set_xlabel("distance along the ray, m")
@@ -101,7 +101,7 @@ def draw_errors(path: Path) -> None:
         figure.add_subplot(
             1, 2, k + 1, title=title, xlabel="camera's distance from the MPI's origin, m", ylabel="pixels"
         )
-        for k, title in enumerate(("error for lack of planes, $e_p$", "error for lack of texels, $e_t$"))
+        for k, title in enumerate(("plane error $e_p$", "texel error $e_t$"))
     ]
     for depth, color in zip((5.0, 10.0, 30.0), COLORS, strict=True):
         points = cameras + np.array([depth, 0.5 * depth, 0.0])
