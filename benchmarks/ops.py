@@ -24,7 +24,7 @@ from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.ops.interpolate import Table, index_rows, read_rows, sum_rows, weigh_rows
 from mmpi_ns.ops.march import MergedSamples
 from mmpi_ns.rendering.rendered import bounded
-from mmpi_ns.sampler import march, merge, rays_of
+from mmpi_ns.sampler import march, march_options, merge, rays_of
 from mmpi_ns.scripts.command import run
 
 COPIED = 1 << 26
@@ -120,7 +120,7 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
 
     def sample():
         forming = not model.progress.schedule.sharpened(model.progress.step)
-        options = model.config.sampling.options(field.plan, forming, blends=False)
+        options = march_options(model.config.sampling, field.plan, forming, blends=False)
         return march(field.layout, field.tables, rays_of(bundle), options)
 
     samples = sample()

@@ -12,17 +12,19 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from mmpi_ns.data.datamanager import MMPIDataManagerConfig
-from mmpi_ns.field.mmpi_field import ColourConfig
-from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import PLACEMENT, RAYS
-from mmpi_ns.placement.rule import PlacementConfig
-from mmpi_ns.rendering.pipeline import MMPIPipelineConfig
-from mmpi_ns.rendering.rendered import RenderingConfig
-from mmpi_ns.training.losses import LossWeights
-from mmpi_ns.training.phases import ScheduleConfig
-from mmpi_ns.training.run import PhaseSchedulerConfig
-from mmpi_ns.training.touched_adam import TouchedAdamConfig
-from mmpi_ns.training.trainer import MMPITrainerConfig
+from mmpi_ns.settings import (
+    ColourConfig,
+    LossWeights,
+    MMPIModelConfig,
+    MMPIPipelineConfig,
+    MMPITrainerConfig,
+    PhaseSchedulerConfig,
+    PlacementConfig,
+    RenderingConfig,
+    ScheduleConfig,
+    TouchedAdamConfig,
+)
 from mmpi_priors.settings import CapturePriorsConfig
 
 PAPER_DATA = {

@@ -18,7 +18,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from mmpi_ns.model import MMPIModelConfig
+from mmpi_ns.settings import MMPIModelConfig
 from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import torch_apart

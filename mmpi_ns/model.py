@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import asdict, replace
 from threading import current_thread, main_thread
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.base_model import Model
 from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
 
 from mmpi_ns.data.datamanager import CAPTURE, Capture
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
+from mmpi_ns.field.mmpi_field import MMPIField, sample_bytes
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import Capacity, MarchOptions
 from mmpi_ns.placement.defaults import steps_for
-from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
@@ -32,7 +29,6 @@ from mmpi_ns.rendering.metrics import ImageMetrics, pictures, psnr_and_ssim
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
     Exposures,
-    RenderingConfig,
     background_of,
     bounded,
     render_rays,
@@ -40,64 +36,21 @@ from mmpi_ns.rendering.rendered import (
     winners,
 )
 from mmpi_ns.rendering.window_store import WindowStore
-from mmpi_ns.sampler import SamplingConfig
+from mmpi_ns.sampler import march_options
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.settings import MMPIModelConfig, PlacementConfig
 from mmpi_ns.training.checkpoints import last_checkpoint
-from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
+from mmpi_ns.training.losses import batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
-from mmpi_ns.training.phases import ScheduleConfig, make_schedule
+from mmpi_ns.training.phases import make_schedule
 from mmpi_ns.training.reliability import assign_heads, blends_in
 from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import Generators
 from mmpi_ns.viewer import PathControls
-
-
-@dataclass
-class MMPIModelConfig(ModelConfig):
-    """Settings of the model: ``--pipeline.model.*``."""
-
-    _target: type = field(default_factory=lambda: MMPIModel)
-    enable_collider: bool = False
-    """Must stay off: a finite far would drop the plane at infinity."""
-    eval_num_rays_per_chunk: int = 0
-    """Rays in a rendering chunk; 0 chooses for the device (on a GPU: as many as fit in half of its free memory)."""
-    size: float = 1.0
-    """Rays of the training and most texels of the plan, over what the capture's pixels need: 0.3 for a quick look, 4
-    for the best field."""
-    placement: PlacementConfig = field(default_factory=PlacementConfig)
-    """Placement and resolution of the MPIs."""
-    plan_file: Path | None = None
-    """A scene plan (JSON) to use instead of the placement rule."""
-    camera_optimizer: CameraOptimizerConfig = field(default_factory=CameraOptimizerConfig)
-    """Refines the poses of the training images during training (docs/captures.md, "Poses that are not exact")."""
-    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    """Phases, growth, learning rates and release of bricks."""
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    """Samples of a ray, and which of them train."""
-    colour: ColourConfig = field(default_factory=ColourConfig)
-    """Features and networks."""
-    ops: dispatch.Route = "auto"
-    """Inner loops: compiled at first use (native; by a C++ compiler on a CPU, by Triton on a GPU), plain torch (torch),
-    or compiled if possible (auto)."""
-    rendering: RenderingConfig = field(default_factory=RenderingConfig)
-    """Images: of which texels, over which background, and the memory for their windows."""
-    loss: LossWeights = field(default_factory=LossWeights)
-    """Weights of the losses."""
-    lpips_net: Literal["vgg", "alex", "none"] = "vgg"
-    """Network of the LPIPS metric (the paper: VGG); left out if its weights (0.5 GB for VGG) are not available."""
-    seed: int = field(default=0, init=False)
-    """Not an option: the trainer sets it from --machine.seed."""
-    total_steps: int = field(default=1, init=False)
-    """Not an option: the trainer sets it from --max-num-iterations; the phases are shares of it. 0: as many as the
-    capture needs."""
-    rays_times: int = field(default=1, init=False)
-    """Not an option: the trainer sets it; how many times the method's rays a step draws on this GPU."""
-    windows_folder: Path | None = field(default=None, init=False)
-    """Not an option: the trainer sets it, and config.yml keeps it for evaluation; where the finished windows lie."""
 
 
 class MMPIModel(Model):
@@ -118,7 +71,7 @@ class MMPIModel(Model):
             joint, placement = self._is_joint(windows), sized
             work = Work(
                 config.colour.feature_channels, not joint, capture.rays_per_step, config.sampling.threshold,
-                all_mpis=not joint and config.schedule.rays_per_mpi == "all", sample_bytes=config.colour.sample_bytes,
+                all_mpis=not joint and config.schedule.rays_per_mpi == "all", sample_bytes=sample_bytes(config.colour),
             )  # fmt: skip
             fixed = config.plan_file is not None or placement.arrangement != "automatic"
             again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))
@@ -210,8 +163,8 @@ class MMPIModel(Model):
         drawn = self.config.schedule.rays_per_mpi, self.draws, progress.step
         bundle, head_mask, choose = assign_heads(bounded(bundle, field.plan), field.plan, phase, *drawn)
         blends = blends_in(phase, field)
-        options = self.config.sampling.options(field.plan, not progress.schedule.sharpened(progress.step), blends)
-        options = options._replace(capacity=self.capacity)
+        forming = not progress.schedule.sharpened(progress.step)
+        options = march_options(self.config.sampling, field.plan, forming, blends)._replace(capacity=self.capacity)
         rays = render_rays(bundle, field, options, head_mask, choose)
         return {"training": replace(rays, times=len(bundle) // asked)}
 

@@ -9,7 +9,6 @@ This is the definition in plain torch; the C++ and Triton forms are in ``ops/mar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -28,6 +27,7 @@ from mmpi_ns.ops.march import march_on_cpu, show_rays_on_cpu
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, plane_hits, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.settings import SamplingConfig
 
 FAIR_SHARE = 0.1
 """While surfaces are forming, samples with more than this fraction of an equal weight are kept."""
@@ -37,22 +37,13 @@ OPAQUE_DEPTH = 9.2
 """Optical depth of an opaque ray: its transmittance, 1e-4, is far below the weight of a kept sample."""
 
 
-@dataclass
-class SamplingConfig:
-    """Samples of a ray: ``--pipeline.model.sampling.*``."""
+def march_options(config: SamplingConfig, plan: ScenePlan, forming: bool, blends: bool) -> MarchOptions:
+    """Which samples are kept in training (``prune``).
 
-    threshold: float = 3e-3
-    """Samples of less weight get no gradient (at most a tenth of an equal share while the resolution grows)."""
-    cube_alpha: float = 1e-3
-    """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
-
-    def options(self, plan: ScenePlan, forming: bool, blends: bool) -> MarchOptions:
-        """Which samples are kept in training (``ops.march.prune``).
-
-        While surfaces are forming, samples of little weight must learn too, and the cube starts nearly empty.
-        """
-        cube = 0.1 * self.cube_alpha if forming and plan.cube is not None else float("inf")
-        return MarchOptions(min(self.threshold, cube), FAIR_SHARE if forming else float("inf"), blends)
+    While surfaces are forming, samples of little weight must learn too, and the cube starts nearly empty.
+    """
+    cube = 0.1 * config.cube_alpha if forming and plan.cube is not None else float("inf")
+    return MarchOptions(min(config.threshold, cube), FAIR_SHARE if forming else float("inf"), blends)
 
 
 def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:

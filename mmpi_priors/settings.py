@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from importlib import import_module
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mmpi_ns.data.priors import PriorsConfig
-
-MAKER = "mmpi_priors.maker", "CapturePriors"
-"""Module and class."""
+from mmpi_ns.settings import Later
 
 
 @dataclass
 class CapturePriorsConfig(PriorsConfig):
     """Priors that are computed for a capture: ``--pipeline.datamanager.priors.*``."""
 
+    _target: Callable[..., Any] = field(default_factory=lambda: Later("mmpi_priors.maker", "CapturePriors"))
     sfm_path: Path = Path("colmap/sparse/0")
     """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
     triangulate: bool = True
@@ -33,8 +32,3 @@ class CapturePriorsConfig(PriorsConfig):
     correct_exposure: bool = True
     """Calibrate exposure and white balance of the images by surfaces that several of them see and by EXIF, and compute
     the colour loss at each image's exposure, if that explains their differences."""
-
-    def setup(self, **kwargs: Any) -> Any:
-        """The ``maker.CapturePriors`` of these settings."""
-        module, name = MAKER
-        return getattr(import_module(module), name)(self, **kwargs)

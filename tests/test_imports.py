@@ -13,12 +13,12 @@ import mmpi_ns
 
 ROOT = Path(mmpi_ns.__file__).parent
 METHOD = [
-    *("utils", "scene", "ops", "heads", "blending", "sampler"),
+    *("utils", "settings", "scene", "ops", "heads", "blending", "sampler"),
     *("placement", "data", "field", "rendering", "training", "viewer", "model", "config"),
 ]
 """Each may import itself and what comes before it."""
 COMPANIONS = {
-    "mmpi_priors": {"utils", "scene", "ops", "placement", "data"},
+    "mmpi_priors": {"utils", "settings", "scene", "ops", "placement", "data"},
     "mmpi_prepare": {"utils", "scene", "placement", "data", "scripts", "mmpi_priors"},
     "mmpi_show": {*METHOD, "functional", "scripts"},
     "mmpi_scene": {"utils", "scripts"},
@@ -89,6 +89,15 @@ def test_importing_the_package_imports_nothing_large():
     """Torch takes seconds: it is imported when a function is first asked for."""
     code = "import sys, mmpi_ns; assert not {'torch', 'nerfstudio', 'numpy'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_settings_of_the_method_are_light():
+    """Every ns-* command reads them, also those that run another method."""
+    code = "import sys, mmpi_ns.config; print(*(m for m in sys.modules if m.startswith('mmpi_') or m in {heavy}))"
+    heavy = {"scipy.signal", "pycolmap"}
+    out = subprocess.run([sys.executable, "-c", code.format(heavy=heavy)], check=True, capture_output=True, text=True)
+    loaded = out.stdout.split()
+    assert not heavy & {*loaded} and len(loaded) <= 30, loaded
 
 
 def test_modules_beside_the_package_have_names_of_their_own():

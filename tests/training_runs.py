@@ -15,7 +15,8 @@ from mmpi_ns.config import mmpi_small
 from mmpi_ns.data.datamanager import MMPIDataManagerConfig
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
-from mmpi_ns.training.phases import ScheduleConfig, make_schedule
+from mmpi_ns.settings import ScheduleConfig
+from mmpi_ns.training.phases import make_schedule
 
 WINDOW_STEPS = 6
 """Of each window in the runs of `tests/training`."""

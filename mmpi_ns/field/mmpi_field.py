@@ -6,7 +6,6 @@ Its tables are in ``tables.py``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
 
@@ -17,7 +16,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
 from mmpi_ns.blending import head_shares, log_shares
-from mmpi_ns.field.shading import ColorNetworks, RayShader, Shading
+from mmpi_ns.field.shading import ColorNetworks, RayShader
 from mmpi_ns.field.tables import Lookup, TexelTables
 from mmpi_ns.heads import heads_of
 from mmpi_ns.ops.composite import Composite, render_colors
@@ -33,29 +32,17 @@ from mmpi_ns.scene.geometry import FACING_EPS, LocalRays, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.visible_tiles import TrainingViews
+from mmpi_ns.settings import ColourConfig, Shading
 
 POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 2, 2
 """Octaves of the positional encodings of NDC positions, where samples are shaded, and of directions."""
 
 
-@dataclass
-class ColourConfig:
-    """Features and networks of colours: ``--pipeline.model.colour.*``."""
-
-    shading: Shading = "ray"
-    """Evaluate the colour network once a ray, after compositing (ray), or for every sample as in the paper (sample)."""
-    feature_channels: int = 8
-    """Channels of a texel besides its density: three of a colour, the others features for view-dependent appearance.
-    Eight are half a cache line, so a CPU trains faster with them than with nine (docs/ablations.md)."""
-    hidden_width: int = 64
-    """Width of the colour networks."""
-
-    @property
-    def sample_bytes(self) -> int:
-        """What the network of one sample holds for its gradients: inputs, layers before and after their activation, and
-        gradients of both. 0 where rays are shaded."""
-        inputs = self.feature_channels + 6 + 6 * (POSITION_FREQUENCIES + DIRECTION_FREQUENCIES)
-        return 4 * (2 * inputs + 6 * self.hidden_width) if self.shading == "sample" else 0
+def sample_bytes(config: ColourConfig) -> int:
+    """What the network of one sample holds for its gradients: inputs, layers before and after their activation, and
+    gradients of both. 0 where rays are shaded."""
+    inputs = config.feature_channels + 6 + 6 * (POSITION_FREQUENCIES + DIRECTION_FREQUENCIES)
+    return 4 * (2 * inputs + 6 * config.hidden_width) if config.shading == "sample" else 0
 
 
 class MMPIField(TexelTables):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -17,10 +16,6 @@ from torch import Tensor, nn
 from mmpi_ns.field.tables import replace_data
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.shade import Layers, SampleNetworks, positional_encoding, run_layers
-
-Shading = Literal["ray", "sample"]
-"""Whether the network is evaluated once a ray or for every sample."""
-
 
 CHANGE = 4.0
 """Change of the log odds of a colour for each unit of network output: a middle grey then changes by one unit."""

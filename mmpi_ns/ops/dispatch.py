@@ -26,9 +26,9 @@ from torch import Tensor
 
 from mmpi_ns.ops import build
 from mmpi_ns.ops.layout import annotated, check_shapes
+from mmpi_ns.settings import Route
 from mmpi_ns.utils.errors import InputError, say
 
-Route = Literal["auto", "torch", "native"]
 Form = Literal["reference", "cpu", "gpu"]
 
 P = ParamSpec("P")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scene.plan import MOST_PLANES, MOST_TEXELS, MOST_VOXELS
+from mmpi_ns.settings import PlacementConfig
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import Number, check_options, shown
 

@@ -11,8 +11,7 @@ Two arrangements are fixed instead: four MPIs by hand along a drive, a baseline,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from mmpi_ns.placement.candidates import Candidate, facing_axes, find_candidates
 from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.observations import Array, Observations, VisiblePoints, find_visible_points, pixels_per_pixel
 from mmpi_ns.scene.plan import MOST_DETAIL, CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.settings import PlacementConfig
 
 MIN_PLANES = 16
 FULL, FINER = 0.8, 1.03
@@ -39,41 +39,6 @@ DRIVE_PULL_BACK = 0.45
 """Distance of the front MPI of a drive behind the first camera, as a fraction of the travel."""
 OVERLAPPING = 1.25
 """Half the extent of each MPI of a room, a tangent: above 1 neighbours overlap."""
-
-
-@dataclass
-class PlacementConfig:
-    """Placement and resolution of the MPIs."""
-
-    arrangement: Literal["automatic", "drive", "room"] = "automatic"
-    """automatic: by the expected pixel error; drive: front, left, right, below; room: five around the centre."""
-    max_mpis: int = 64
-    """Maximum number of MPIs (automatic)."""
-    max_texels: float = 16e6
-    """Approximate maximum of texels and voxels in total; texels are made larger to meet it; 0: no limit (automatic)."""
-    min_gain: float = 1.0
-    """Minimum gain of an MPI in bits: how often it must halve the expected error of one training image (automatic)."""
-    planes: int = 64
-    """Planes of every MPI (drive, room)."""
-    max_planes: int = 256
-    """Maximum planes of an MPI; each gets as many as the points it serves need (automatic)."""
-    plane_pixels: float = 0.35
-    """Plane error allowed for four fifths of the points of an MPI, relative to a texel's pixels (automatic)."""
-    texel_pixels: float = 1.5
-    """Image pixels that a texel spans, seen from the origin of the MPI (automatic)."""
-    rays_per_texel: float = 5.0
-    """Training rays that meet the footprint of a texel, of all images that see it: a short run on large images that
-    overlap little gets larger texels (automatic)."""
-    height: int = 96
-    """Texel rows of every MPI (drive, room)."""
-    width: int = 256
-    """Texel columns of every MPI (drive, room)."""
-    window_length: float = 5.0
-    """Longer captures are split into windows of this length, in median distances of the content; 0: never."""
-    faces: tuple[str, ...] = ("front", "left", "right", "below")
-    """Which MPIs of the drive to use (drive)."""
-    cube_voxels: int = 0
-    """Voxels along each side of the centred cube; 0 for none (room)."""
 
 
 def place(observations: Observations, config: PlacementConfig, training_rays: int | None = None) -> ScenePlan:

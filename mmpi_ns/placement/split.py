@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from mmpi_ns.placement.observations import Array, Observations, farthest_first, find_visible_points
-from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.placement.rule import place
 from mmpi_ns.scene.windows import Window, WindowedPlan
+from mmpi_ns.settings import PlacementConfig
 
 MARGIN = 0.08
 """Distance over which the share of a window falls off, as a fraction of the windows' length."""

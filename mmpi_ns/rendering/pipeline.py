@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
 from typing import Any, cast
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from torch import Tensor
@@ -19,6 +18,7 @@ from torchvision.utils import save_image
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.details import moved_cameras
+from mmpi_ns.settings import MMPIPipelineConfig
 from mmpi_ns.utils.errors import say
 from mmpi_ns.utils.random_draws import generator
 
@@ -30,16 +30,6 @@ RAYS = 1024
 """Pixels of each step."""
 RATES = (2e-3, 5e-5)
 """Learning rates at the start and at the end: radians, and scene units."""
-
-
-@dataclass
-class MMPIPipelineConfig(VanillaPipelineConfig):
-    """Settings of the pipeline."""
-
-    _target: type = field(default_factory=lambda: MMPIPipeline)
-    refine_eval_poses: bool = False
-    """Score each evaluated image a second time, with its pose refined against the trained model: metrics "refined_...",
-    in addition to the plain ones (docs/captures.md, "Poses that are not exact")."""
 
 
 class MMPIPipeline(VanillaPipeline):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,22 +32,6 @@ def background_of(name: str, like: Tensor) -> Tensor:
     """Background colour [3]: of the viewer or a crop if set, else of this name."""
     asked = renderers.BACKGROUND_COLOR_OVERRIDE
     return like.new_full((3,), BACKGROUNDS[name]) if asked is None else asked.to(like)
-
-
-@dataclass
-class RenderingConfig:
-    """Images: ``--pipeline.model.rendering.*``."""
-
-    threshold: float = 3e-3
-    """Samples of less weight are not shaded when rendering; their total weight is reported (dropped_mass)."""
-    background: Literal["black", "gray", "white"] = "gray"
-    """Background when rendering. Training uses random colours where the MPIs cover the whole ray."""
-    nearest_images: int = 6
-    """Nearest training images whose details, which the field lacks, are added to an image (docs/details.md); 0 shows
-    the field alone, and a training with 0 keeps no details."""
-    resident_gib: float = 2.0
-    """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
-    fit are kept, at least one; the least recently used is evicted first."""
 
 
 class Exposures(torch.nn.Module):

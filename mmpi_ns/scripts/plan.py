@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_for
-from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import run
+from mmpi_ns.settings import PlacementConfig
 from mmpi_ns.utils.errors import InputError, looked_at, quoted, say
 from mmpi_ns.utils.values import Number, check_options
 

@@ -29,7 +29,7 @@ from mmpi_ns.utils.values import shown
 
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "rays", "capture"}
 """Keys of every checkpoint of this method."""
-PLAN_FILE = "plan.json"
+PLAN_FILE, WINDOWS_FOLDER = "plan.json", "windows"
 _held: dict[Path, FileLock] = {}
 
 

@@ -5,8 +5,6 @@ Weights and normalisations: docs/how_it_works.md. Total variation is computed on
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -15,6 +13,7 @@ from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.depth_sums import DepthSums, depth_sums
 from mmpi_ns.rendering.rendered import RenderedRays
+from mmpi_ns.settings import LossWeights
 
 CLIPPED = 0.98
 """Colour of an image above which a channel may be clipped."""
@@ -27,30 +26,6 @@ DEPTH_OUTLIERS = 0.02
 KEYPOINT_WIDTH, KEYPOINT_OUTLIERS = 0.06, 1e-4
 """Standard deviation of the window round an SfM keypoint, relative to its inverse distance, and likelihood of a false
 one. Its mean is over the keypoint rays that can reach their point."""
-
-
-@dataclass
-class LossWeights:
-    """Weights of the losses added to the photometric one."""
-
-    point_color: float = 0.01
-    """Colour of each sample against its ray's."""
-    background_entropy: float = 0.001
-    """Entropy of the transmittance of a ray."""
-    distortion: float = 0.01
-    """Spread of a ray's weights over distance (distortion)."""
-    keypoint_depth: float = 0.02
-    """-log of the weights near an SfM keypoint (scenes with tracks)."""
-    depth_priors: float = 0.01
-    """-log of the likelihood of a pixel's known depth, from dense matches, an SfM point or a sensor. Falls with the
-    learning rates: in the end colours are more accurate."""
-    tv_density: float = 1e-4
-    """Total variation of the densities, in DVGO's normalisation (there: 1e-5)."""
-    tv_features: float = 1e-5
-    """Total variation of the features, in the same normalisation (there: 1e-6)."""
-    tv_chroma: float = 50.0
-    """Weight of differences of chroma (a texel's colour less the mean of its channels), as a multiple of
-    ``tv_features``: few rays leave colours that waver, and surfaces change hue less than brightness."""
 
 
 def photometric(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import fields
 from operator import attrgetter
 from pathlib import Path
@@ -11,7 +12,8 @@ import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
 from mmpi_ns.placement.defaults import NOT_NEGATIVE, POSITIVE, check_placement
-from mmpi_ns.training.losses import LossWeights
+from mmpi_ns.settings import LossWeights, MMPITrainerConfig
+from mmpi_ns.training.checkpoints import WINDOWS_FOLDER, checkpoint_to_load, claim
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.machine import unused_gpu
@@ -75,6 +77,27 @@ NO_EFFECT = {
     "pipeline.model": ("enable_collider", "collider_params", "loss_coefficients", "prompt"),
 }
 """nerfstudio's options that have no effect on this method."""
+
+
+def checked(config: MMPITrainerConfig) -> TrainerConfig:
+    """Checks the options of a run and locks its folder; the settings for its config.yml.
+
+    They tell ns-eval and ns-render where the capture and the windows are, from whatever folder they are started, but
+    not which checkpoint this run resumes from, which they must not load.
+    """
+    check_run(config)
+    checkpoint_to_load(config)
+    folder = config.get_base_dir()
+    claim(folder, config.get_checkpoint_dir(), config.load_checkpoint or config.load_dir)
+    written = copy.deepcopy(config)
+    written.load_dir = written.load_step = written.load_checkpoint = None
+    manager: Any = written.pipeline.datamanager
+    for part, name in ((written, "output_dir"), (written, "data"), (manager, "data"), (manager.dataparser, "data")):
+        path = getattr(part, name)
+        if path not in (None, Path()):
+            setattr(part, name, path.absolute())
+    written.pipeline.model.windows_folder = (folder / WINDOWS_FOLDER).absolute()  # type: ignore[attr-defined]
+    return written
 
 
 def check_run(config: TrainerConfig) -> None:

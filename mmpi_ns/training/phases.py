@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import accumulate, pairwise
-from typing import Literal
 
+from mmpi_ns.settings import ScheduleConfig
 from mmpi_ns.training.reliability import TRAINS, phase_lengths
 from mmpi_ns.utils.errors import InputError
 
@@ -21,32 +21,6 @@ GROWING_SHARE, FULL_STEPS = 0.5, 1250
 Runs of at most so many steps draw all; longer ones draw at least as many rays in total (docs/ablations.md)."""
 COPIES_FROM = 0.75
 """Share of the period of high learning rates after which MPIs may get finer copies."""
-
-
-@dataclass
-class ScheduleConfig:
-    """What trains when: ``--pipeline.model.schedule.*``."""
-
-    training: Literal["two-phase", "joint"] = "joint"
-    """Train each MPI alone, then reliability (two-phase), or all MPIs together without reliability (joint)."""
-    rays_per_mpi: Literal["split", "all"] = "all"
-    """Individual phase: each MPI renders all rays of a batch (all; K times the work, about that of joint training), or
-    the MPIs share them (split)."""
-    blend_share: float = 0.05
-    """Share of the steps in which only reliability trains."""
-    finetune_share: float = 0.4
-    """Share of the steps in which everything trains together at the end."""
-    decay_decades: float = 1.0
-    """Decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5),"""
-    decay_from: float = 0.5
-    """after being constant for this fraction of it."""
-    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
-    """When the texels of a plane double, as shares of the first phase; four times as early if depths are known."""
-    release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
-    """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
-    before the texels double."""
-    release_weight: float = 7.5e-3
-    """Bricks in which no sample of a training ray has this weight are released; 0 keeps all that rays can reach."""
 
 
 @dataclass(frozen=True)

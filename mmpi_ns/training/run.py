@@ -5,15 +5,15 @@ Also the refined poses, with which the rays of a batch move.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
-from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from nerfstudio.engine.schedulers import Scheduler
 from torch import Tensor, nn
 from torch.nn import Parameter
 from torch.optim import Optimizer
@@ -26,13 +26,12 @@ from mmpi_ns.placement.split import cameras_of
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
+from mmpi_ns.settings import PhaseSchedulerConfig
 from mmpi_ns.training.initial import start_from_depths
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.training.reliability import TRAINS, prepare_parameters
 from mmpi_ns.training.storage import prepare_storage
 from mmpi_ns.utils.files import to_bytes, to_text
-
-WINDOWS_FOLDER = "windows"
 
 
 @torch.no_grad()
@@ -109,18 +108,6 @@ class Progress(nn.Module):
         self.windows = WindowedPlan.from_json(to_text(self.windows_bytes))
         self.schedule = Schedule.from_json(to_text(self.schedule_bytes))
         self.window = int(self.window_number)
-
-
-@dataclass
-class PhaseSchedulerConfig(SchedulerConfig):
-    """Learning rate of one parameter kind: 0 where it is frozen, decaying over each phase in which it trains."""
-
-    _target: type = field(default_factory=lambda: PhaseScheduler)
-    kind: str = "density"
-    """Parameter kind of the group."""
-    progress: ClassVar[Progress | None] = None
-    """Not an option: the trainer gives it to its copy of the config. Rates are those of its schedule, also if a
-    checkpoint replaces that, and constant without it (a config used outside this trainer)."""
 
 
 class PhaseScheduler(Scheduler):

@@ -6,11 +6,9 @@ Equal to dense Adam in which entries without a gradient are skipped, with values
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from nerfstudio.engine.optimizers import OptimizerConfig
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -110,12 +108,3 @@ class TouchedAdam(torch.optim.Optimizer):
         params = [param for group in self.param_groups for param in group["params"]]
         for number, state in state_dict["state"].items():
             self.state[params[number]]["moments"] = state["moments"].to(params[number].device)
-
-
-@dataclass
-class TouchedAdamConfig(OptimizerConfig):
-    """Settings of TouchedAdam."""
-
-    _target: type = TouchedAdam
-    lr: float = 0.1
-    """Learning rate at the start of the group's phase."""

@@ -5,15 +5,13 @@ from __future__ import annotations
 import copy
 import sys
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from time import monotonic
 from typing import Any, Literal, NoReturn, cast
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 
 from mmpi_ns.data.datamanager import MMPIDataManager
@@ -23,25 +21,26 @@ from mmpi_ns.placement.defaults import RAYS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
 from mmpi_ns.rendering.pipeline import MMPIPipeline
 from mmpi_ns.rendering.rendered import bounded
+from mmpi_ns.sampler import march_options
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.settings import MMPITrainerConfig, PhaseSchedulerConfig
 from mmpi_ns.training.agreement import RAYS as AGREEMENT_RAYS
 from mmpi_ns.training.agreement import disagreement
 from mmpi_ns.training.checkpoints import (
     PLAN_FILE,
+    WINDOWS_FOLDER,
     cameras_in_short,
     check_same_run,
     checkpoint_to_load,
     checkpoints_in,
-    claim,
     read_checkpoint,
     states_of,
     write_plan,
 )
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.options import check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
-from mmpi_ns.training.run import WINDOWS_FOLDER, PhaseSchedulerConfig, TrainingRun, cameras_of, views_of
+from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.step_graph import StepGraphs
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
@@ -49,42 +48,6 @@ from mmpi_ns.utils.host import discard, keep_freed_memory, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
 from mmpi_ns.utils.random_draws import generator
-
-
-@dataclass
-class MMPITrainerConfig(TrainerConfig):
-    """nerfstudio's trainer settings."""
-
-    _target: type = field(default_factory=lambda: MMPITrainer)
-    max_num_iterations: int = 0
-    """Steps of the whole run, resumed or not; if a long capture is split into windows, of each window. 0: as many as
-    its pixels need (2,500 to 12,000, times --pipeline.model.size)."""
-    graphs: bool = True
-    """On a GPU: repeat steps as CUDA graphs, several times faster than one operation at a time (docs/gpu.md)."""
-
-    def print_to_terminal(self) -> None:
-        """Prints where all settings are, which are more than a terminal has lines."""
-        say(f"All settings of this run: {self.get_base_dir() / 'config.yml'}")
-
-    def save_config(self) -> None:
-        """Checks the options, locks the run's folder, and writes config.yml.
-
-        It tells ns-eval and ns-render where the capture and the windows are, from whatever folder they are started, but
-        not which checkpoint this run resumes from, which they must not load.
-        """
-        check_run(self)
-        checkpoint_to_load(self)
-        folder = self.get_base_dir()
-        claim(folder, self.get_checkpoint_dir(), self.load_checkpoint or self.load_dir)
-        written = copy.deepcopy(self)
-        written.load_dir = written.load_step = written.load_checkpoint = None
-        manager: Any = written.pipeline.datamanager
-        for part, name in ((written, "output_dir"), (written, "data"), (manager, "data"), (manager.dataparser, "data")):
-            path = getattr(part, name)
-            if path not in (None, Path()):
-                setattr(part, name, path.absolute())
-        written.pipeline.model.windows_folder = (folder / WINDOWS_FOLDER).absolute()  # type: ignore[attr-defined]
-        TrainerConfig.save_config(written)
 
 
 class MMPITrainer(Trainer):
@@ -241,7 +204,7 @@ class MMPITrainer(Trainer):
         g = generator(model.config.seed, progress.step, "agreement", self.device)
         bundle, _ = sources.draw(AGREEMENT_RAYS, g)
         forming = not progress.schedule.sharpened(progress.step)
-        options = model.config.sampling.options(field.plan, forming, field.blends)
+        options = march_options(model.config.sampling, field.plan, forming, field.blends)
         return disagreement(field, bounded(bundle, field.plan), options)
 
     def train_iteration(self, step: int) -> Any:

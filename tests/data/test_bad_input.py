@@ -14,7 +14,8 @@ from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, name_of, write_scene
 from training_runs import datamanager, ready, trainer_config
 
-from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.placement.rule import place
+from mmpi_ns.settings import PlacementConfig
 from mmpi_priors.observe import ENOUGH_KEYPOINTS
 
 

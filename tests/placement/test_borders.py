@@ -10,8 +10,9 @@ from procedural import observations_of
 from still_life import still_life
 
 from mmpi_ns.placement.observations import find_visible_points
-from mmpi_ns.placement.rule import WIDEST, PlacementConfig, border_points, place, widened
+from mmpi_ns.placement.rule import WIDEST, border_points, place, widened
 from mmpi_ns.scene.plan import MPIPlan
+from mmpi_ns.settings import PlacementConfig
 from mmpi_scene.catalogue import make_scene
 
 

@@ -11,7 +11,8 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from mmpi_ns.data.rays import lens_directions
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.placement.rule import place
+from mmpi_ns.settings import PlacementConfig
 from mmpi_ns.utils.errors import InputError
 
 SIDE, COUNT = 160, 10

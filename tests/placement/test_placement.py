@@ -10,8 +10,9 @@ from reprojection import median_reprojection_error
 
 from mmpi_ns.placement.errors import mpi_errors, pixel_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
-from mmpi_ns.placement.rule import PlacementConfig, place, texel_limits
+from mmpi_ns.placement.rule import place, texel_limits
 from mmpi_ns.scene.plan import MPIPlan
+from mmpi_ns.settings import PlacementConfig
 
 FOCAL, WIDTH, HEIGHT = 180.0, 310.0, 94.0
 OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes of a camera that looks along +z with y down

@@ -12,8 +12,9 @@ from still_life import still_life
 from mmpi_ns.placement.candidates import find_candidates
 from mmpi_ns.placement.errors import WORST, mpi_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points
-from mmpi_ns.placement.rule import ENOUGH, PlacementConfig, place
+from mmpi_ns.placement.rule import ENOUGH, place
 from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.settings import PlacementConfig
 from mmpi_scene.catalogue import make_scene
 
 CONFIG = PlacementConfig(max_texels=0)

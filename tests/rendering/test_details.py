@@ -14,7 +14,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.model import MMPIModel, MMPIModelConfig
+from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.details import HERE, LEAST_WEIGHT, MIDDLE, STRENGTH
 from mmpi_ns.rendering.details import (
     LARGEST,
@@ -25,6 +25,7 @@ from mmpi_ns.rendering.details import (
     moved_cameras,
     write_details,
 )
+from mmpi_ns.settings import MMPIModelConfig
 from mmpi_ns.utils.errors import InputError
 
 HEIGHT, WIDTH = 20, 28

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
+from mmpi_ns.settings import PlacementConfig
 
 
 def test_mpis_a_ray_can_meet_do_not_grow_with_the_road():

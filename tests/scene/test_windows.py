@@ -14,11 +14,11 @@ from long_road import road
 from training_runs import datamanager, schedule_of
 
 from mmpi_ns.placement.defaults import FEW, MANY, RAYS, rays_times, steps_for
-from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import find_balls, most_pixels, of_cameras, place_windows
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
-from mmpi_ns.training.phases import ScheduleConfig, make_schedule
+from mmpi_ns.settings import PlacementConfig, ScheduleConfig
+from mmpi_ns.training.phases import make_schedule
 
 # Splitting -----------------------------------------------------------------------------------------------------------
 
