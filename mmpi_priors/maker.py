@@ -96,7 +96,7 @@ class CapturePriors(PriorsMaker):
     ) -> tuple[SharedPoints | None, str]:
         """Points that two of the images, by number, see at the same depth; and why there are none."""
         if priors.depths is None or priors.depths.share == 0:
-            return None, "no pixel has a known depth"
+            return None, "no pixel has a depth prior"
         posed = posed_images(priors.observations, self.dataset)
         if posed is None:
             return None, "a camera is neither perspective nor fisheye"

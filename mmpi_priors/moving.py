@@ -232,11 +232,11 @@ def share_of_moving(masks: Sequence[Mask]) -> str:
     """Share of moving pixels in the training images, as a sentence."""
     shares = np.array([mask.mean() for mask in masks])
     if not shares.any():
-        return "Nothing is seen to move in the training images"
+        return "No moving objects are detected in the training images"
     count = np.count_nonzero(shares)
     return (
-        f"{100 * shares.mean():.1f} % of the training pixels, in {count} of {len(masks)} images, seem to move and are "
-        "masked"
+        f"{100 * shares.mean():.1f} % of the training pixels, in {count} of {len(masks)} images, show moving objects "
+        "and are masked"
     )
 
 

@@ -45,7 +45,7 @@ class Gpu:
             tell(f"{name}: {value}")
         report["device"] = device = "cuda" if torch.cuda.is_available() else "cpu"
         if device == "cpu":
-            tell("torch sees no GPU, so nothing is said of one here: what follows is this machine's processor.")
+            tell("torch sees no GPU: the following is measured on this machine's CPU.")
         reason = dispatch.fault("Triton" if device == "cuda" else "C++")
         report["timed"] = timed = time_training(device, noise(self.folder / "noise"), (self.folder / "run").resolve())
         step, frame, pixels = timed["step_ms"], timed["frame_ms"], timed["pixels"]

@@ -144,7 +144,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             )  # fmt: skip
             has_keypoints = self.config.keypoint_rays > 0 and len(priors.observations.seen_at) > 0
             if not has_keypoints and share == 0:
-                say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")
+                say("No depth priors, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
 
     @cached_property
@@ -169,7 +169,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             if shared := len(set(names[0]).intersection(names[1])):
                 say(f"{shared} of {count} test images are training images too: scores say little about new views.")
             return self._test_images
-        say("The capture has no test images: scores are of training images, and say nothing about new views.")
+        say("The capture has no test images: scores are of training images, not of new views.")
         return self.dataset_type(self.train_dataparser_outputs, scale_factor=self.config.camera_res_scale_factor)
 
     def setup_train(self) -> None:
@@ -221,7 +221,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if len(seen.points):
             parts.append(f"{len(seen.points):,} points seen {len(seen.seen_by):,} times")
         if self.priors is not None and self.priors.depths is not None:
-            parts.append(f"{100 * self.priors.depths.share:.0f} % of the training pixels have a known depth")
+            parts.append(f"{100 * self.priors.depths.share:.0f} % of the training pixels have a depth prior")
         return f"Capture: {'; '.join(parts)}."
 
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:

@@ -113,7 +113,7 @@ class MMPIPipeline(VanillaPipeline):
         exposures = model.exposures.factors, model.exposures.falloff
         exposure = manager.maker.exposure_of(manager.observations, *exposures, camera, observed, outputs)
         if exposure is None:
-            say("No training image shows what an evaluated one does, or they are gone: it is scored at mean exposure.")
+            say("No training image sees the surfaces of an evaluated one: it is scored at mean exposure.")
             return outputs
         exposed = {
             name.replace("radiance", "rgb"): outputs[name] for name in ("radiance", "field_radiance") if name in outputs

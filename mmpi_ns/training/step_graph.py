@@ -305,7 +305,7 @@ class StepGraphs:
         gradients.replay()
         if expected is not None:
             if differs := self._difference(expected, (held[0].values, gradients_of(fields))):
-                self._give_up(f"repeated they compute something else ({differs})")
+                self._give_up(f"replayed, they compute something else ({differs})")
                 return None
             self._compared.add(of_kind)
 

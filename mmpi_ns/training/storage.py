@@ -90,7 +90,7 @@ def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any,
             give_back_freed_memory()
             field.grow(factor, tiles)
             give_back_freed_memory()
-            say(f"Texels are {factor:.1f} times as many as planned now, in the room that released ones left.")
+            say(f"The number of texels is now {factor:.1f} times the planned one, in the memory of released bricks.")
             return
         factor *= min(0.98, budget / needed)
 
