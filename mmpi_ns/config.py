@@ -32,7 +32,7 @@ PAPER_DATA = {
     "new_view_share": 0.0,
     "priors": CapturePriorsConfig(dense_depth=False, depth_images=False, mask_moving=False, correct_exposure=False),
 }
-"""The paper trains on the colours of pixels alone; no point cloud is read either."""
+"""The paper trains on the colours of pixels alone; point clouds are not read either."""
 PAPER_SCHEDULE = ScheduleConfig(decay_from=0.0, decay_decades=1.5, release_weight=0.0)
 """The paper's rates fall from the start, as DVGO's, and no bricks are released."""
 POSE_RATE = 1e-4

@@ -62,12 +62,12 @@ class MMPIModel(Model):
         super().populate_modules()
         config = self.config
         self.capture: Capture | None = self.kwargs.get("metadata", {}).get(CAPTURE)
-        """What is known of the training images; None where the plan comes from a checkpoint."""
+        """Data of the training images; None where the plan comes from a checkpoint."""
         capture, device = self.capture, self.kwargs.get("device", "cpu")
         views = None if capture is None else capture.views
         sized = replace(config.placement, max_texels=config.size * config.placement.max_texels)
         windows = self._plan(sized)
-        if capture is not None:  # fewer texels than the rule would like, where memory is short
+        if capture is not None:  # fewer texels than the rule's, where memory is short
             joint, placement = self._is_joint(windows), sized
             work = Work(
                 config.colour.feature_channels, not joint, capture.rays_per_step, config.sampling.threshold,
@@ -88,7 +88,7 @@ class MMPIModel(Model):
         self.metrics = ImageMetrics(config.lpips_net)
         self.draws = Generators(config.seed, device)
         self.capacity: Capacity | None = None
-        """Of a training batch on a GPU; None: as many samples as there are."""
+        """Capacity of a training batch on a GPU; None: as many samples as there are."""
         self.register_buffer("decay", torch.tensor(1.0), persistent=False)
         """``Schedule.decay`` of the step."""
         self.decay: Tensor
@@ -108,7 +108,7 @@ class MMPIModel(Model):
         self.register_load_state_dict_post_hook(type(self)._take_plan)
 
     def _is_joint(self, windows: WindowedPlan) -> bool:
-        """Whether all MPIs train in one go. One head has nothing to blend with."""
+        """Whether all MPIs train jointly; a single head always does."""
         return self.config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
 
     def _plan(self, placement: PlacementConfig) -> WindowedPlan:
@@ -127,7 +127,7 @@ class MMPIModel(Model):
         return place_windows(observations, placement, config.total_steps * capture.rays_per_step)
 
     def _new_field(self, views: TrainingViews | None = None) -> MMPIField:
-        """A field of this run's settings, of the first window at the first resolution: to train, or to load into."""
+        """A field with this run's settings, of the first window at the first resolution: to train, or to load into."""
         schedule = self.progress.schedule
         return MMPIField(
             self.progress.windows.plans[0],
@@ -140,7 +140,7 @@ class MMPIModel(Model):
         )
 
     def _take_plan(self, _: Any = None) -> None:
-        """Takes over plan and schedule, also of a checkpoint that was loaded."""
+        """Applies plan and schedule, also those of a loaded checkpoint."""
         self.field.shares_depth = self.progress.schedule.is_joint
         self.show.set_options(["all", *self.progress.windows.names])
 
@@ -193,7 +193,7 @@ class MMPIModel(Model):
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
     ) -> dict[str, Tensor]:
         """``image_outputs`` of one window, by its number and field; winning MPIs are counted through all windows.
-        ``chosen``: the one (window, head) to show; None for all."""
+        ``chosen``: the only (window, head) to render; None for all."""
         first_head = sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         bundle = bounded(bundle, field.plan)
@@ -216,7 +216,7 @@ class MMPIModel(Model):
     # Images ------------------------------------------------------------------------------------------------------
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Renders a camera's image, or what of it lies in a box. Raises InputError where either has no size."""
+        """Renders a camera's image, or the part inside a box. Raises InputError if either has no size."""
         # In the viewer an error would end the render thread while the user types a size: it shows the background.
         if obb_box is not None and not bool((obb_box.S > 0).all()) and current_thread() is main_thread():
             raise InputError(
@@ -235,7 +235,7 @@ class MMPIModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """Renders an image: window by window, each as many rays at once as asked for or as suit the device."""
+        """Renders an image: window by window, in chunks of the configured size or of one that suits the device."""
         with torch_apart():
             outputs = self.image_outputs(camera_ray_bundle.flatten(), self.chunk_size)
             outputs = {name: values.view(*camera_ray_bundle.shape, -1) for name, values in outputs.items()}
@@ -245,7 +245,7 @@ class MMPIModel(Model):
             return self.details.added(outputs, camera_ray_bundle, nearest, self.exposures.mean)
 
     def update_to_step(self, step: int) -> None:
-        """Is told the step of a checkpoint before it is loaded."""
+        """Loads the details of a checkpoint's step, before the checkpoint."""
         folder = self.config.windows_folder
         if self.config.rendering.nearest_images and folder is not None and self.capture is None:
             self.details = details_of(folder.parent / DETAILS_FOLDER, step)
@@ -264,7 +264,7 @@ class MMPIModel(Model):
         return rays_per_chunk(most, self.device, kept if one_pass else None)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""
+        """Colours without their background, and accumulation (ns-render's output "rgba")."""
         accumulation = outputs["accumulation"]
         background = background_of(self.config.rendering.background, accumulation)
         colors = outputs[output_name] - (1 - accumulation) * background
@@ -302,8 +302,8 @@ class MMPIModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics of an image, "field_..." of the field without details, the mean "dropped_mass" and, where distances
-        are known, the relative error of rendered ones, median and share above a tenth; and pictures of it."""
+        """Metrics of an image, "field_..." of the field without details, the mean "dropped_mass" and, with true
+        distances, the relative error of rendered ones, median and share above a tenth; and pictures of it."""
         observed, true = self.observed(batch).to(outputs["rgb"].device), batch.get("distance")
         values = self.metrics(outputs["rgb"], observed)
         if "field_rgb" in outputs:

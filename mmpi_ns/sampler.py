@@ -38,9 +38,9 @@ OPAQUE_DEPTH = 9.2
 
 
 def march_options(config: SamplingConfig, plan: ScenePlan, forming: bool, blends: bool) -> MarchOptions:
-    """Which samples are kept in training (``prune``).
+    """Options of the march in training: threshold of the kept samples (``prune``).
 
-    While surfaces are forming, samples of little weight must learn too, and the cube starts nearly empty.
+    While surfaces form, samples of little weight must learn too, and the cube starts nearly empty.
     """
     cube = 0.1 * config.cube_alpha if forming and plan.cube is not None else float("inf")
     return MarchOptions(min(config.threshold, cube), FAIR_SHARE if forming else float("inf"), blends)

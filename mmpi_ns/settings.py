@@ -1,6 +1,6 @@
-"""Options of the method, light to import: every ``ns-*`` command reads those of all methods.
+"""Options of the method, quick to import: every ``ns-*`` command reads those of all methods.
 
-What they set up is imported when it is set up (``Later``). The options of the data manager stand beside it: ns-render
+Their targets are imported when they are called (``Later``). The options of the data manager are beside it: ns-render
 changes the class that its ``_target`` names.
 """
 
@@ -38,7 +38,7 @@ class Later:
 
 
 CHECKED = Later("mmpi_ns.training.options", "checked")
-"""Settings as they are written, once they are checked and the run's folder is locked."""
+"""Checks settings, locks the run's folder and returns the settings for its config.yml."""
 
 
 @dataclass
@@ -52,7 +52,7 @@ class PlacementConfig:
     max_texels: float = 16e6
     """Approximate maximum of texels and voxels in total; texels are made larger to meet it; 0: no limit (automatic)."""
     min_gain: float = 1.0
-    """Minimum gain of an MPI in bits: how often it must halve the expected error of one training image (automatic)."""
+    """Minimum gain of an MPI in bits, one for each halving of the expected error of one training image (automatic)."""
     planes: int = 64
     """Planes of every MPI (drive, room)."""
     max_planes: int = 256
@@ -62,23 +62,23 @@ class PlacementConfig:
     texel_pixels: float = 1.5
     """Image pixels that a texel spans, seen from the origin of the MPI (automatic)."""
     rays_per_texel: float = 5.0
-    """Training rays that meet the footprint of a texel, of all images that see it: a short run on large images that
-    overlap little gets larger texels (automatic)."""
+    """Minimum number of training rays through a texel, from all images that see it: short runs on large images with
+    little overlap get larger texels (automatic)."""
     height: int = 96
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
     """Texel columns of every MPI (drive, room)."""
     window_length: float = 5.0
-    """Longer captures are split into windows of this length, in median distances of the content; 0: never."""
+    """Length of the windows into which longer captures are split, in median distances of the content; 0: no windows."""
     faces: tuple[str, ...] = ("front", "left", "right", "below")
-    """Which MPIs of the drive to use (drive)."""
+    """MPIs of the drive to use (drive)."""
     cube_voxels: int = 0
     """Voxels along each side of the centred cube; 0 for none (room)."""
 
 
 @dataclass
 class ScheduleConfig:
-    """What trains when: ``--pipeline.model.schedule.*``."""
+    """Training schedule: ``--pipeline.model.schedule.*``."""
 
     training: Literal["two-phase", "joint"] = "joint"
     """Train each MPI alone, then reliability (two-phase), or all MPIs together without reliability (joint)."""
@@ -94,12 +94,13 @@ class ScheduleConfig:
     decay_from: float = 0.5
     """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
-    """When the texels of a plane double, as shares of the first phase; four times as early if depths are known."""
+    """Times at which the texels of a plane double, as shares of the first phase; four times as early with depth
+    priors."""
     release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
-    """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
-    before the texels double."""
+    """Times at which empty bricks (8 x 8 texels of a plane) are released, as shares of the first phase: after growth,
+    or just before the texels double."""
     release_weight: float = 7.5e-3
-    """Bricks in which no sample of a training ray has this weight are released; 0 keeps all that rays can reach."""
+    """Bricks in which no sample of a training ray has this weight are released; 0 keeps all reachable ones."""
 
 
 @dataclass
@@ -107,7 +108,7 @@ class SamplingConfig:
     """Samples of a ray: ``--pipeline.model.sampling.*``."""
 
     threshold: float = 3e-3
-    """Samples of less weight get no gradient (at most a tenth of an equal share while the resolution grows)."""
+    """Weight below which samples get no gradient (at most a tenth of an equal share while the resolution grows)."""
     cube_alpha: float = 1e-3
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
 
@@ -130,12 +131,12 @@ class RenderingConfig:
     """Images: ``--pipeline.model.rendering.*``."""
 
     threshold: float = 3e-3
-    """Samples of less weight are not shaded when rendering; their total weight is reported (dropped_mass)."""
+    """Weight below which samples are not shaded when rendering; their total weight is reported (dropped_mass)."""
     background: Literal["black", "gray", "white"] = "gray"
-    """Background when rendering. Training uses random colours where the MPIs cover the whole ray."""
+    """Background when rendering. Training uses random colours where the MPIs cover the ray fully."""
     nearest_images: int = 6
-    """Nearest training images whose details, which the field lacks, are added to an image (docs/details.md); 0 shows
-    the field alone, and a training with 0 keeps no details."""
+    """Number of nearest training images whose details (residuals) are added to an image (docs/details.md); 0 renders
+    the field alone, and a training with 0 writes no details."""
     resident_gib: float = 2.0
     """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
     fit are kept, at least one; the least recently used is evicted first."""
@@ -154,15 +155,15 @@ class LossWeights:
     keypoint_depth: float = 0.02
     """-log of the weights near an SfM keypoint (scenes with tracks)."""
     depth_priors: float = 0.01
-    """-log of the likelihood of a pixel's known depth, from dense matches, an SfM point or a sensor. Falls with the
-    learning rates: in the end colours are more accurate."""
+    """-log of the likelihood of a pixel's depth prior, from dense matches, an SfM point or a sensor. Falls with the
+    learning rates, as colours are more accurate in the end."""
     tv_density: float = 1e-4
     """Total variation of the densities, in DVGO's normalisation (there: 1e-5)."""
     tv_features: float = 1e-5
     """Total variation of the features, in the same normalisation (there: 1e-6)."""
     tv_chroma: float = 50.0
     """Weight of differences of chroma (a texel's colour less the mean of its channels), as a multiple of
-    ``tv_features``: few rays leave colours that waver, and surfaces change hue less than brightness."""
+    ``tv_features``: colours are noisy where rays are few, and surfaces vary less in hue than in brightness."""
 
 
 @dataclass
@@ -175,8 +176,8 @@ class MMPIModelConfig(ModelConfig):
     eval_num_rays_per_chunk: int = 0
     """Rays in a rendering chunk; 0 chooses for the device (on a GPU: as many as fit in half of its free memory)."""
     size: float = 1.0
-    """Rays of the training and most texels of the plan, over what the capture's pixels need: 0.3 for a quick look, 4
-    for the best field."""
+    """Factor on training rays and maximum texels relative to the defaults for the capture: 0.3 for a quick look, 4 for
+    the best field."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Placement and resolution of the MPIs."""
     plan_file: Path | None = None
@@ -186,27 +187,27 @@ class MMPIModelConfig(ModelConfig):
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     """Phases, growth, learning rates and release of bricks."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    """Samples of a ray, and which of them train."""
+    """Samples of a ray, and their threshold in training."""
     colour: ColourConfig = field(default_factory=ColourConfig)
     """Features and networks."""
     ops: Route = "auto"
     """Inner loops: compiled at first use (native; by a C++ compiler on a CPU, by Triton on a GPU), plain torch (torch),
     or compiled if possible (auto)."""
     rendering: RenderingConfig = field(default_factory=RenderingConfig)
-    """Images: of which texels, over which background, and the memory for their windows."""
+    """Images: threshold, background, details, and memory for windows."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the losses."""
     lpips_net: Literal["vgg", "alex", "none"] = "vgg"
-    """Network of the LPIPS metric (the paper: VGG); left out if its weights (0.5 GB for VGG) are not available."""
+    """Network of the LPIPS metric (the paper: VGG); omitted if its weights (0.5 GB for VGG) are not available."""
     seed: int = field(default=0, init=False)
     """Not an option: the trainer sets it from --machine.seed."""
     total_steps: int = field(default=1, init=False)
     """Not an option: the trainer sets it from --max-num-iterations; the phases are shares of it. 0: as many as the
     capture needs."""
     rays_times: int = field(default=1, init=False)
-    """Not an option: the trainer sets it; how many times the method's rays a step draws on this GPU."""
+    """Not an option: the trainer sets it. Factor on the method's rays per step on this GPU."""
     windows_folder: Path | None = field(default=None, init=False)
-    """Not an option: the trainer sets it, and config.yml keeps it for evaluation; where the finished windows lie."""
+    """Not an option: the trainer sets it, and config.yml stores it for evaluation. Folder of the finished windows."""
 
 
 @dataclass
@@ -236,8 +237,8 @@ class PhaseSchedulerConfig(SchedulerConfig):
     kind: str = "density"
     """Parameter kind of the group."""
     progress: ClassVar[Any] = None
-    """Not an option: the trainer gives it to its copy of the config. Rates are those of its schedule, also if a
-    checkpoint replaces that, and constant without it (a config used outside this trainer)."""
+    """Not an option: the trainer sets it in its copy of the config. Rates follow its schedule, also if a checkpoint
+    replaces that; without it they are constant (a config used outside this trainer)."""
 
 
 @dataclass
@@ -249,10 +250,10 @@ class MMPITrainerConfig(TrainerConfig):
     """Steps of the whole run, resumed or not; if a long capture is split into windows, of each window. 0: as many as
     its pixels need (2,500 to 12,000, times --pipeline.model.size)."""
     graphs: bool = True
-    """On a GPU: repeat steps as CUDA graphs, several times faster than one operation at a time (docs/gpu.md)."""
+    """On a GPU: replay steps as CUDA graphs, several times faster than one operation at a time (docs/gpu.md)."""
 
     def print_to_terminal(self) -> None:
-        """Prints where all settings are, which are more than a terminal has lines."""
+        """Prints the path of config.yml in place of all settings, which would fill the terminal."""
         say(f"All settings of this run: {self.get_base_dir() / 'config.yml'}")
 
     def save_config(self) -> None:

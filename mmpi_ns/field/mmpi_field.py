@@ -39,8 +39,8 @@ POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 2, 2
 
 
 def sample_bytes(config: ColourConfig) -> int:
-    """What the network of one sample holds for its gradients: inputs, layers before and after their activation, and
-    gradients of both. 0 where rays are shaded."""
+    """Bytes that the network of one sample stores for its gradients: inputs, layers before and after their activation,
+    and gradients of both. 0 where rays are shaded."""
     inputs = config.feature_channels + 6 + 6 * (POSITION_FREQUENCIES + DIRECTION_FREQUENCIES)
     return 4 * (2 * inputs + 6 * config.hidden_width) if config.shading == "sample" else 0
 

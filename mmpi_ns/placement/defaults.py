@@ -8,19 +8,19 @@ from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import Number, check_options, shown
 
 STEPS, LEAST_STEPS, RAYS = 4000, 2500, 1024
-"""Training steps of a capture of ``FEW`` to ``MANY`` pixels, of one of fewer pixels, and rays of a step. More rays make
-the field better and images with details no better: they learn single images (docs/ablations.md)."""
+"""Training steps of a capture of ``FEW`` to ``MANY`` pixels, minimum for one of fewer pixels, and rays of a step. More
+rays improve the field, but not images with details: the field overfits single images (docs/ablations.md)."""
 PLACEMENT = PlacementConfig(texel_pixels=1.2)
 FEW, MANY = 2.6e6, 10.4e6
-"""Training pixels of a window: below the first steps become fewer in proportion, above the second more."""
+"""Training pixels of a window below which steps decrease in proportion, and above which they increase."""
 MOST_TIMES = 3.0
 """Largest multiple of the steps."""
 RAYS_PER_PROCESSOR = 256
-"""Pixel rays of a step for each multiprocessor of a GPU. By its registers the march has eight programs of 16 rays there
-at a time, so these and the rays of new views are some three rounds of them."""
+"""Pixel rays of a step per multiprocessor of a GPU. Its registers hold eight programs of the march, of 16 rays each, so
+these and the rays of new views take about three rounds."""
 MOST_RAYS_TIMES = 4
-"""Largest multiple of a method's rays: steps become as many times fewer. As many rays in a quarter of the steps give
-images as good, in an eighth worse ones (docs/ablations.md)."""
+"""Maximum factor on a method's rays, by which steps are divided. The same rays in a quarter of the steps give equally
+good images, in an eighth worse ones."""
 POSITIVE, NOT_NEGATIVE = Number(0, above=True), Number(0)
 RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),
@@ -35,15 +35,15 @@ FACES = ("front", "left", "right", "below")
 
 
 def rays_times(processors: int) -> int:
-    """How many times its rays a run with defaults draws in a step, in as many times fewer steps; a power of two.
+    """Factor on the rays per step of a run with defaults, by which its steps are divided; a power of two.
     ``processors`` are the multiprocessors of the GPU, 0 on a CPU."""
     fit = RAYS_PER_PROCESSOR * processors // RAYS
     return min(1 << max(fit, 1).bit_length() - 1, MOST_RAYS_TIMES)
 
 
 def steps_for(pixels: float, size: float = 1.0, times: int = 1) -> int:
-    """Training steps of a window, in hundreds: fewer for few training pixels, more for many (``FEW``, ``MANY``), in
-    proportion; ``size`` times as many, and fewer if a step draws several ``times`` the rays (``rays_times``)."""
+    """Training steps of a window, in hundreds, by its training pixels (``FEW``, ``MANY``), multiplied by ``size`` and
+    divided by ``times``, the factor on the rays per step (``rays_times``)."""
     multiple = min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES)
     return 100 * max(1, round(size * max(LEAST_STEPS, STEPS * multiple) / 100)) // times
 

@@ -1,4 +1,4 @@
-"""The placement rule: as many MPIs as lower the expected pixel error enough, each where it lowers it most.
+"""The placement rule: MPIs are added where they lower the expected pixel error most, as long as each lowers it enough.
 
 Greedy facility location (Nemhauser et al. 1978) over ``candidates.py``: every observation is served by the chosen head
 with the smallest expected error for it (``errors.py``), and the candidate that lowers the mean of log2(error) most for
@@ -24,15 +24,15 @@ from mmpi_ns.settings import PlacementConfig
 
 MIN_PLANES = 16
 FULL, FINER = 0.8, 1.03
-"""Share of the budget of texels that is enough; and the step of their size while there is room for finer ones."""
+"""Share of the texel budget that is enough, and factor of the texel size in the search."""
 BUDGET_ROUNDS = 8
-"""Attempts at keeping to the budget of texels; each starts with coarser ones."""
+"""Maximum number of attempts to meet the texel budget, each with coarser texels."""
 BEYOND = 0.05
-"""Margin around an image that should have texels, as a fraction of its sides, because other views look there."""
+"""Margin around an image that should have texels, as a fraction of its sides, for other views."""
 WIDEST, FARTHEST = 3.0, 0.5
-"""Limits on widened tangents, absolute and relative: a border far from all MPIs would cost too much."""
+"""Limits on widened tangents, absolute and relative: a border far from all MPIs would be too expensive."""
 ENOUGH = 0.85
-"""Expected error that needs no further MPI, relative to a texel's pixels."""
+"""Expected error, relative to a texel's pixels, below which no further MPI is needed."""
 TEXELS_PER_RAY = 8.0
 """Maximum texels for each training ray, in total: more would overfit."""
 DRIVE_PULL_BACK = 0.45
@@ -42,8 +42,8 @@ OVERLAPPING = 1.25
 
 
 def place(observations: Observations, config: PlacementConfig, training_rays: int | None = None) -> ScenePlan:
-    """The scene plan for some training cameras and what they saw. Texels are no finer than the pixel rays of the whole
-    training can train, if known. Raises ValueError if all observations are behind their cameras."""
+    """The scene plan for training cameras and their observations. Texels are no finer than ``training_rays``, the pixel
+    rays of the whole training, can train. Raises ValueError if all observations are behind their cameras."""
     visible = find_visible_points(observations)
     if config.arrangement == "room":
         return _room(observations, visible.near, config)
@@ -136,7 +136,7 @@ def _choose(
             texel_pixels = (too_fine * texel_pixels) ** 0.5
     # The last that fits; if none does, the last.
     choice, texel_pixels, heads, used = ([t for t in tried if t[-1] <= 1.0] or tried)[-1]
-    # Texels a little finer may have asked for further heads, which do not fit: then there is room for those alone.
+    # Slightly finer texels may have required further heads, which do not fit: then there is room for those alone.
     while used < FULL and texel_pixels / FINER >= finest:
         finer, used = heads_at(choice, texel_pixels / FINER)
         if used > 1.0:
@@ -152,7 +152,7 @@ class _Choice:
         self, candidates: list[Candidate], weights: NDArray[np.float64], config: PlacementConfig, texel_pixels: float
     ) -> None:
         self.candidates, self.weights, self.config = candidates, weights, config
-        # Of each observation if a candidate serves it: log2 of the expected pixel error over ``ENOUGH``.
+        # Cost of each observation in each candidate: log2 of the expected pixel error over ``ENOUGH``.
         enough, cost = ENOUGH * texel_pixels, []
         for c in candidates:
             error = np.hypot(c.plane / (config.max_planes - 1), 0.5 * texel_pixels * c.texel)
@@ -161,7 +161,7 @@ class _Choice:
         self.nothing = np.full(self.cost.shape[1], self.cost.max(), np.float32)
         texels = [c.at(texel_pixels, config.max_planes).texels for c in candidates]
         self.texels = np.array(texels, dtype=np.float64)
-        self.price = np.sqrt(self.texels)  # by which the gain of a candidate is divided
+        self.price = np.sqrt(self.texels)  # the gain of a candidate is divided by it
         self.chosen = self._choose()
 
     def heads(self, texel_pixels: float) -> list[MPIPlan]:
@@ -195,10 +195,11 @@ class _Choice:
                 if len(grown) == 1 or losses[least] >= self.config.min_gain:
                     break
                 del grown[least]
-            if self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
+            if self._total(grown) >= self._total(chosen):  # it makes itself or a better one superfluous
                 break
             chosen = grown
-        # The first is chosen for its texels, and further ones may only make up for it: one of as many may do alone.
+        # The first is chosen relative to its texels, and further ones may only compensate for it: another one may
+        # suffice alone.
         affordable = self.texels <= self.texels[chosen].sum()
         alone = [int(np.where(affordable, gain, -1.0).argmax())]
         spared = self.config.min_gain * (len(chosen) - 1)

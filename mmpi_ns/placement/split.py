@@ -19,9 +19,9 @@ MARGIN = 0.08
 FEWEST = 8
 """Minimum training cameras of a window; smaller ones are merged with their neighbours."""
 SLACK = 1.1
-"""Windows may be longer than configured by this factor."""
+"""Factor by which windows may be longer than configured."""
 ROUNDS = 50
-"""Rounds of moving windows to the middle of their cameras."""
+"""Rounds of moving windows to the centres of their cameras."""
 
 
 class Ball(NamedTuple):
@@ -57,8 +57,8 @@ def most_pixels(observations: Observations, config: PlacementConfig) -> float:
 
 
 def find_balls(observations: Observations, length: float) -> list[Ball]:
-    """Where the windows are, in order along the way; independent of the cameras' order. ``length`` is
-    the maximum of a window, in median distances of the content; 0 for no windows."""
+    """The balls of the windows, in order along the path; independent of the cameras' order. ``length`` is the maximum
+    of a window, in median distances of the content; 0 for no windows."""
     if length <= 0:
         return []
     visible = find_visible_points(observations)
@@ -67,7 +67,8 @@ def find_balls(observations: Observations, length: float) -> list[Ball]:
     spread = np.linalg.norm(centers - centers.mean(0), axis=-1)
     if 2 * spread.max() <= longest:
         return []
-    # The fewest balls, hardly longer than allowed, that hold all cameras: of places far apart, at most twice as many.
+    # The fewest balls, hardly longer than allowed, that contain all cameras: farthest-point sampling needs at most
+    # twice as many.
     start = centers[farthest_first(centers, radius=longest / 2)]
     middles, low, high = _settled(centers, start), 1, len(start)
     while low < high:
@@ -77,14 +78,14 @@ def find_balls(observations: Observations, length: float) -> list[Ball]:
             middles, high = fewer, count
         else:
             low = count + 1
-    while len(middles) > 1:  # without windows of too few cameras, smallest first; neighbours take these over
+    while len(middles) > 1:  # removes windows of too few cameras, smallest first; neighbours take their cameras
         counts = np.bincount(cdist(centers, middles).argmin(-1), minlength=len(middles))
         if counts.min() >= FEWEST:
             break
         middles = _settled(centers, np.delete(middles, counts.argmin(), axis=0))
     owner = cdist(centers, middles).argmin(-1)
     radii = [float(np.linalg.norm(centers[owner == i] - m, axis=-1).max()) for i, m in enumerate(middles)]
-    # Neighbours follow each other: from the window farthest from the middle of all, always to the nearest.
+    # Order: from the window farthest from the centre of all, always to the nearest.
     order, left = [], list(range(len(middles)))
     at = middles[np.linalg.norm(middles - middles.mean(0), axis=-1).argmax()]
     while left:
@@ -116,7 +117,7 @@ def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observ
 
 
 def _settled(centers: Array, middles: Array) -> Array:
-    """Moves every ball to the middle of the cameras nearest to it (Lloyd)."""
+    """Balls moved to the centres of the cameras nearest to them (Lloyd)."""
     for _ in range(ROUNDS):
         owner = cdist(centers, middles).argmin(-1)
         balls = [centers[owner == i] for i in range(len(middles)) if (owner == i).any()]
