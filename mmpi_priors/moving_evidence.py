@@ -1,9 +1,9 @@
-"""Evidence that a pixel shows something that moves, from neighbouring images, their depths and the ground.
+"""Evidence of moving pixels, from neighbouring images, their depths and the ground.
 
-A static point looks alike in all images that see it. So each pixel is compared with its neighbours at every inverse
-depth that a static point there may have: its own or that of a pixel beside it, the depths of the neighbours, the
-ground's, and infinity. A pixel that none of them explains moves if two neighbours agree about something else behind it,
-or if an impossible depth explains it (``moving_sweep.py``).
+A static point looks alike in all images that see it. So each pixel is compared with its neighbours at every possible
+inverse depth: its own or that of an adjacent pixel, the depths of the neighbours, the ground's, and infinity. A pixel
+that matches at none of them is moving if two neighbours agree on another surface behind it, or if it matches at an
+impossible depth (``moving_sweep.py``).
 """
 
 from __future__ import annotations
@@ -24,69 +24,69 @@ Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 SAME = 12
-"""Levels by which colours of one surface differ, beyond the range of colours of the pixels around."""
+"""Tolerance of colours of one surface in gray levels, beyond the range of the pixels around."""
 SPARSE = 2
-"""Side of the squares of pixels of which one gives its depth to another image, and which get one depth."""
+"""Side of the squares of pixels that are reduced to one depth in another image."""
 SOLID = 0.75
-"""Inverse depths below this multiple of the ground's lie below the ground."""
+"""Multiple of the ground's inverse depth below which a point lies below the ground."""
 SLOPE = 0.05
-"""Tangent of the angle below the horizon from which a pixel may show the ground only: roads rise and fall."""
+"""Tangent of the angle below the horizon from which ground depths are used: roads rise and fall."""
 STEEP = 20.0
-"""Degrees between the normal of the ground and up."""
+"""Maximum angle between the normal of the ground and up, degrees."""
 GROUND_SHARE, BELOW_SHARE = 0.08, 0.03
-"""Share of the known depths that lie on the ground, at least, and below it, at most."""
+"""Minimum share of the depths on the ground, and maximum share below it."""
 OCCLUDES, NEAR = 1.15, 13
-"""A neighbour shows a point if its inverse depth in a window of this many pixels is the same but for this factor."""
+"""A neighbour sees a point if an inverse depth in a window of this many pixels agrees up to this factor."""
 NEAREST = 95
-"""Percentile of an image's inverse depths that stands for the nearest content."""
+"""Percentile of an image's inverse depths taken as the nearest content."""
 CLEARLY, WINDOW = 80, 5
-"""Levels beyond which a larger difference says no more, and side of the window over which differences are averaged."""
+"""Gray levels at which differences are truncated, and side of the window over which they are averaged."""
 NOISE = 75
-"""Percentile of the differences of surfaces of known depth that stands for the noise; some of them move."""
+"""Percentile of the differences at pixels with a depth, taken as the noise; some of them move."""
 ALL = 255
 TURNED = 3.0
-"""Degrees between the facing directions of two images from which the camera turned between them. Where it goes straight
-on, what neighbours say nothing about is mostly what stands (docs/ablations.md)."""
+"""Minimum angle between the directions of two images for a turn of the camera, degrees. Without a turn, pixels that no
+neighbour sees are mostly static."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """An image at working size, with what is known of it."""
+    """An image at working size, with depth and ground."""
 
     view: View
     color: Bytes
     """Blue, green, red, a little blurred. [h, w, 3]"""
     depth: Depth
     ground: Map | None
-    """Inverse depth of the ground, 0 near the horizon and above; None where no ground is found. [h, w]"""
+    """Inverse depth of the ground, 0 near the horizon and above; None if no ground is detected. [h, w]"""
     horizon: NDArray[np.float64] | None = None
-    """Row of the horizon in each column, where a ground is found. [w]"""
+    """Row of the horizon in each column, if a ground is detected. [w]"""
     level: NDArray[np.float64] | None = None
-    """The horizon also where no ground is found; None where the camera looks steeply up or down. [w]"""
+    """The horizon, also without a ground; None if the camera looks steeply up or down. [w]"""
 
     @cached_property
     def around(self) -> Map:
-        """Inverse depth of the nearest pixel that has one, 0 where none is near. [h, w]"""
+        """Inverse depth of the nearest pixel with one, 0 where none is near. [h, w]"""
         near = cv2.dilate((self.depth.inverse > 0).astype(np.uint8), np.ones((NEAR, NEAR), np.uint8)) > 0
         return np.where(near, nearest_known(self.depth.inverse), 0) if near.any() else self.depth.inverse
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Levels from 0 to 255. [h, w] each"""
+    """Evidence in gray levels from 0 to 255. [h, w] each"""
 
     strong: Bytes
-    """By which a pixel differs from every neighbour at every possible depth, though neighbours agree about what is
-    behind it or it has an impossible depth."""
+    """Difference of a pixel from every neighbour at every possible depth, where neighbours agree on a surface behind it
+    or it has an impossible depth."""
     weak: Bytes
-    """By which it differs from all neighbours but one, two of which agree about what is behind it."""
+    """Difference from all neighbours but one, two of which agree on a surface behind it."""
     behind: Bytes
-    """By which it differs from what two neighbours agree to be behind it."""
+    """Difference from the surface behind it that two neighbours agree on."""
     judged: Mask
-    """Two neighbours agree about a surface there, so that something else in front of it is seen; everywhere if the
+    """Mask where two neighbours agree on a surface, so that an object in front of it is detectable; everywhere if the
     camera did not turn between the image and the two nearest."""
     noise: float
-    """Levels by which surfaces of known depth differ from all neighbours but one, most of them."""
+    """Noise: gray levels by which most pixels with a depth differ from all neighbours but one."""
 
 
 def turned(view: View, other: View) -> bool:
@@ -145,7 +145,7 @@ def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:
 
 
 def splat(shot: Shot, other: Shot) -> Map:
-    """Inverse depths at the pixels of a shot from those of another one, the nearest of several in a square. [h, w]"""
+    """Inverse depths of a shot's pixels, projected from another shot; the nearest of several in a square. [h, w]"""
     height, width = shot.view.gray.shape
     every = np.s_[::SPARSE, ::SPARSE]
     measured = np.nonzero(other.depth.inverse[every])
@@ -169,7 +169,7 @@ def splat(shot: Shot, other: Shot) -> Map:
 
 
 def nearest_known(inverse: Map) -> Map:
-    """Every pixel's inverse depth, or that of the nearest pixel that has one. [h, w]"""
+    """Inverse depth of every pixel, or of the nearest pixel with one. [h, w]"""
     measured = inverse > 0
     _, label = cv2.distanceTransformWithLabels(
         (~measured).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
@@ -180,8 +180,8 @@ def nearest_known(inverse: Map) -> Map:
 
 
 def possible_depths(shot: Shot, others: Sequence[Neighbour]) -> tuple[list[Map], list[Map]]:
-    """Inverse depths that a static point may have, 0 where there is none: those from the image itself, and those of
-    surfaces that other images or the ground put there."""
+    """Possible inverse depths of static points, 0 where there is none: those from the image itself, and those of
+    surfaces in other images and of the ground."""
     splats = np.stack([splat(shot, other.shot) for other in others])
     farthest = np.where(splats > 0, splats, np.inf).min(0)
     behind = [np.where(np.isfinite(farthest), farthest, 0).astype(np.float32), splats.max(0)]
@@ -195,10 +195,10 @@ def possible_depths(shot: Shot, others: Sequence[Neighbour]) -> tuple[list[Map],
 
 @dataclass(frozen=True)
 class Warp:
-    """Where another image shows the pixels of a shot, as OpenCV counts: from the middle of the first one."""
+    """Positions of a shot's pixels in another image, in OpenCV's convention: 0 is the centre of the first one."""
 
     far: list[Map]
-    """Homogeneous pixels of what is infinitely far. [h, w] each"""
+    """Homogeneous pixels at infinity. [h, w] each"""
     shifts: list[float]
     """Their change for each unit of inverse depth."""
 
@@ -210,12 +210,12 @@ class Warp:
         return Warp(far, (middle @ parallax.b).tolist())
 
     def at(self, pixels: tuple[NDArray[np.intp], ...], times: int) -> Warp:
-        """Of some pixels, in so many equal rows."""
+        """The warp of some pixels, repeated in rows."""
         return Warp([np.repeat(far[pixels][None], times, 0) for far in self.far], self.shifts)
 
     def places(self, inverse: Map) -> tuple[Map, Map, Map]:
-        """Pixels x and y at these inverse depths, and depths over those in the shot, at most 0 behind the camera, where
-        the pixels mean nothing. [h, w] each"""
+        """Pixels x and y at these inverse depths, and ratio of depths to those in the shot, at most 0 behind the
+        camera, where the pixels are meaningless. [h, w] each"""
         right, down, ahead = (
             np.asarray(cv2.scaleAdd(inverse, shift, far), np.float32)
             for shift, far in zip(self.shifts, self.far, strict=True)
@@ -226,7 +226,7 @@ class Warp:
 
 @dataclass(frozen=True)
 class Neighbour:
-    """Another image as it is compared with a shot."""
+    """Another image, for comparison with a shot."""
 
     shot: Shot
     color: Bytes
@@ -242,7 +242,7 @@ class Neighbour:
         return Neighbour(other, color, Warp.between(shot.view, other.view))
 
     def with_still(self, moves: Mask | None) -> Bytes:
-        """Its colours, and ALL inside the lens where nothing moves as far as is known, else 0. [h, w, 4]"""
+        """Colours, and ALL inside the lens where nothing is masked as moving, else 0. [h, w, 4]"""
         still = self.shot.view.inside if moves is None else self.shot.view.inside & ~moves
         layer = np.asarray(cv2.cvtColor(self.color, cv2.COLOR_BGR2BGRA), np.uint8)
         layer[..., 3] = 0
@@ -253,12 +253,11 @@ class Neighbour:
 def _compare(
     shot: Shot, others: Sequence[Neighbour], layers: Sequence[Bytes], inverse: Map, pairs: bool
 ) -> tuple[list[Bytes], Bytes, Mask]:
-    """A shot against its neighbours, with what stands still as a fourth channel, at some inverse depths.
+    """Comparison of a shot with its neighbours, with static pixels as a fourth channel, at some inverse depths.
 
     Returns:
-        Levels by which the colours of each neighbour differ, ALL where it shows nothing. [h, w] each
-        Levels by which the shot differs from both of two neighbours that agree and have nothing in front. [h, w]
-        Where two neighbours do. [h, w]
+        Differences of the colours of each neighbour, ALL where it sees nothing. [h, w] each Difference of the shot from
+        both of two neighbours that agree and have nothing in front. [h, w] Mask where two neighbours agree so. [h, w]
     """
     kernel, four = np.ones((3, 3), np.uint8), cv2.cvtColor(shot.color, cv2.COLOR_BGR2BGRA)
     nearest, farthest = OCCLUDES * inverse, inverse / OCCLUDES
@@ -305,13 +304,13 @@ def two_least(levels: Sequence[Bytes]) -> tuple[Bytes, Bytes]:
 
 
 def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], impossible: Mask) -> Evidence:
-    """What of a shot no static scene explains.
+    """Evidence of pixels of a shot that match no static scene.
 
     Args:
         shot: the image.
         others: its neighbours.
-        masks: what moves in each neighbour, as far as is known. [h, w]
-        impossible: where only an impossible depth is alike (``moving_sweep.py``). [h, w]
+        masks: of moving objects in each neighbour so far. [h, w]
+        impossible: mask of pixels that match only at an impossible depth (``moving_sweep.py``). [h, w]
     """
     shape = shot.view.gray.shape
     if len(others) < 2:
@@ -330,7 +329,7 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
         one, two = np.minimum(one, first), np.minimum(two, second)
         behind = np.maximum(behind, pair & all_where(possible))
         judged |= agreed & possible
-    # Nobody can tell where fewer than two neighbours would show even the nearest content.
+    # Undecidable where fewer than two neighbours would see even the nearest content.
     measured = shot.depth.inverse[shot.depth.inverse > 0]
     nearest = np.full(shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
     showing = np.zeros(shape, np.uint8)
@@ -350,9 +349,8 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
 
 
 def least_unlike(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], box: tuple[slice, slice]) -> Bytes:
-    """Levels by which a shot differs from the neighbour most like it, without what moves there, at the possible depth
-    that is best; ALL where none shows anything, and outside of a box. Other arguments are those of ``evidence``.
-    [h, w]"""
+    """Difference of a shot from the most similar neighbour, without its moving objects, at the best possible depth; ALL
+    where none sees anything, and outside of a box. Other arguments are those of ``evidence``. [h, w]"""
     layers = [other.with_still(mask) for other, mask in zip(others, masks, strict=True)]
     mine, surfaces = possible_depths(shot, others)
     part, result = replace(shot, color=shot.color[box]), np.full(shot.view.gray.shape, ALL, np.uint8)

@@ -1,7 +1,7 @@
-"""Whole objects from scattered evidence that something moves: seeds, growth along edges, following from image to image.
+"""Whole objects from scattered evidence of motion: seeds, growth along edges, tracking from image to image.
 
-Conservative where it is doubtful: a seed is an area, not a line, that no depth explains at which two neighbours agree,
-and that two neighbours would show at any depth.
+Conservative: a seed is an area, not a line, that matches at no depth at which two neighbours agree, and that two
+neighbours would see at any depth.
 """
 
 from __future__ import annotations
@@ -29,50 +29,50 @@ from mmpi_priors.moving_evidence import (
 from mmpi_priors.views import look_up, pixel_grid
 
 LEAST_LEVELS, NOISES = 12.0, 4.0
-"""Levels of strong evidence from which a pixel is a seed: the first, plus this multiple of the image's noise."""
+"""Threshold of strong evidence for a seed: gray levels, plus this multiple of the image's noise."""
 WEAKER = 1.3
-"""Times as many levels of weak evidence make a seed."""
+"""Factor on the threshold for weak evidence."""
 STEPS, PARTS, REACH = 48, 4, 1.2
-"""Inverse depths at which seeds are searched in the neighbours, in so many parts, up to this multiple of the nearest
+"""Number of inverse depths at which seeds are compared with the neighbours, up to this multiple of the nearest
 content's."""
 UNASKED = -1
-"""Instead of the levels of a pixel that was no candidate so far."""
+"""Value of a pixel that was no candidate so far."""
 DENSITY, AROUND = 0.35, 7
-"""Share of seeds in a window of this many pixels around a seed that is kept."""
+"""Minimum share of seeds in a window of this many pixels around a seed."""
 LEAST_PIXELS, LEAST_SIDE = 15, 4
-"""Seeds of an object, and the shorter side of what they span, pixels at working size."""
+"""Minimum number of seeds of an object, and minimum shorter side of their extent, pixels at working size."""
 TOGETHER = 15
-"""Pixels across which seeds belong to one object."""
+"""Maximum gap between seeds of one object, pixels."""
 TALL = 1.15
-"""Height of an object over that of the camera, at most."""
+"""Maximum height of an object relative to the camera's."""
 NARROW, UPRIGHT, LOW = 0.4, 1.05, 0.8
-"""Width over the height of the camera below which an object is a person, as tall as the second, with a head of other
-colours than its body; others are filled up to the third."""
+"""Width relative to the camera's height below which an object is a person, with a height up to the second and a head of
+other colours than its body; other objects are filled up to the third."""
 SHADED = 0.8
-"""The same for a person with a shadow on the ground: it is filled up only between the columns of its upper seeds."""
+"""The same for a person with a shadow on the ground, which is filled only between the columns of its upper seeds."""
 CORE = 0.1
-"""Share of an object that seeds cover, at least, and half of it where neighbours say nothing: else it is a strip that
-fell out of what stands."""
+"""Minimum share of an object covered by seeds, half of it where no neighbour sees the background: other objects are
+strips of static surfaces."""
 UNSEEN, GAP, LOWEST = 0.5, 3, 0.24
-"""Share of pixels beside an object or below it about which neighbours say nothing, from which it may reach there; the
-gap between is its width over twice the second, at most; and rows below it over those below the horizon, at most, for
-it to be cut off there."""
+"""Minimum share of undecidable pixels beside or below an object for it to extend there; the gap between is at most its
+width over twice the second; maximum ratio of the rows below it to those below the horizon for it to be cut off
+there."""
 CERTAIN = 10
-"""Levels of evidence up to which a pixel of known depth is static."""
+"""Maximum evidence of a static pixel with a depth, gray levels."""
 STANDS = 0.1
-"""Share of an object that lies below the height of the camera, at least: what moves stands on the ground, and branches,
-chimneys and towers in front of the sky look like movers where few images show them from far apart."""
+"""Minimum share of an object below the height of the camera: moving objects stand on the ground, and branches, chimneys
+and towers in front of the sky look like moving ones where few images far apart see them."""
 ITERATIONS, LARGE = 3, 4000
-"""Of GrabCut, and pixels from which on it is done at half the size."""
+"""Iterations of GrabCut, and number of pixels above which it runs at half the size."""
 FOLLOWED, INNER = 0.7, 3
-"""Correlation with the neighbour from which an object is followed, and pixels across which it is shrunk there where the
-camera did not turn, as its outline is uncertain."""
+"""Minimum correlation with the neighbour for an object to be tracked, and erosion of its uncertain outline where the
+camera did not turn, pixels."""
 
 
 def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence, levels: NDArray[np.int16]) -> Mask:
-    """Pixels that show something that moves, beyond doubt. [h, w]
+    """Pixels that certainly move. [h, w]
 
-    ``levels`` are those of ``unexplained`` where it has been asked, else UNASKED, and are written to. [h, w]
+    ``levels`` caches the results of ``unexplained``, UNASKED where it was not called, and is updated. [h, w]
     """
     least = LEAST_LEVELS + NOISES * evidence.noise
     candidates = (evidence.strong > least) | (evidence.weak > WEAKER * least)
@@ -84,10 +84,10 @@ def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence, levels: N
 
 
 def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> NDArray[np.uint8]:
-    """Levels by which some pixels differ from all neighbours but one, at the depth where they differ least; where that
-    is below what a seed needs, at some depth. [P]
+    """Minimum over depths of the difference of some pixels from all neighbours but one; where it is below the threshold
+    of a seed, that at some depth. [P]
 
-    0 where two neighbours show nothing at one of the depths: nobody can tell.
+    0 where two neighbours see nothing at one of the depths: undecidable.
     """
     rows, columns = np.nonzero(candidates)
     measured = shot.depth.inverse[shot.depth.inverse > 0]
@@ -119,13 +119,13 @@ def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> ND
 
 
 def is_static(shot: Shot, evidence: Evidence) -> Mask:
-    """Where a possible depth is known and nothing contradicts it. [h, w]"""
+    """Pixels with a possible depth that nothing contradicts. [h, w]"""
     static = (shot.depth.inverse > 0) & (evidence.behind < CERTAIN) & (evidence.weak < CERTAIN)
     return static if shot.ground is None else static & (shot.depth.inverse > SOLID * shot.ground)
 
 
 def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
-    """The objects that seeds lie on, by GrabCut in a box around them. [h, w]"""
+    """Objects around seeds, by GrabCut in a box. [h, w]"""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (TOGETHER, TOGETHER))
     number, labels = cv2.connectedComponents(cv2.dilate(core.astype(np.uint8), kernel))
     static = is_static(shot, evidence)
@@ -143,10 +143,10 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
 
 
 def room_of(shot: Shot, judged: Mask, part: Mask) -> tuple[tuple[int, int, int, int], int]:
-    """Left, top, right and bottom of what the object of some seeds may cover, and the row from which it is its body.
+    """Left, top, right and bottom of the box of the object of some seeds, and the row at which its body starts.
 
-    Seeds lie only where neighbours show what is behind them. Next to the border of an image few do, so an object may
-    reach on to where they say nothing.
+    Seeds lie only where neighbours see the background. Next to the border of an image few do, so an object may extend
+    to undecidable pixels.
     """
     (height, width), (rows, columns) = part.shape, np.nonzero(part)
     left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
@@ -160,7 +160,7 @@ def room_of(shot: Shot, judged: Mask, part: Mask) -> tuple[tuple[int, int, int, 
     if height - bottom < LOWEST * (height - horizon) and below.size and below.mean() < 1 - UNSEEN:
         bottom = height
     highest, body = top - 0.3 * (bottom - top), top
-    if shot.horizon is not None and bottom > horizon:  # it stands on the ground, as seen from the camera's height
+    if shot.horizon is not None and bottom > horizon:  # it stands on the ground
         highest = min(top - 0.1 * (bottom - top), bottom - TALL * (bottom - horizon))
         tall = UPRIGHT if right - left < NARROW * (bottom - horizon) else LOW
         body = min(top, round(bottom - tall * (bottom - horizon)))
@@ -168,7 +168,7 @@ def room_of(shot: Shot, judged: Mask, part: Mask) -> tuple[tuple[int, int, int, 
 
 
 def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int, int, int, int], body: int) -> Mask:
-    """The object that covers some pixels for certain and others in its room perhaps: by GrabCut, and with its body."""
+    """The object that covers some pixels certainly and others in its box possibly, by GrabCut, with its body."""
     height, (left, top, right, bottom) = len(part), room
     margin = max(8, round(0.3 * max(right - left, bottom - max(0, top))))
     inside = np.s_[max(0, top - margin) : bottom + margin, max(0, left - margin) : right + margin]
@@ -193,7 +193,7 @@ def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int,
     upper = np.flatnonzero(part[: (body + last_row) // 2].any(0))
     if shot.horizon is not None and len(upper) >= LEAST_SIDE:
         below = last_row - float(shot.horizon[columns_of].mean())
-        if np.ptp(np.flatnonzero(columns_of)) < SHADED * below:  # what lies beside the feet is a shadow
+        if np.ptp(np.flatnonzero(columns_of)) < SHADED * below:  # pixels beside the feet are a shadow
             columns_of[: upper[0]] = columns_of[upper[-1] + 1 :] = False
     first, last = part.argmax(0), height - 1 - part[::-1].argmax(0)
     y = np.arange(height)[:, None]
@@ -204,7 +204,7 @@ def _object(shot: Shot, part: Mask, judged: Mask, static: Mask, room: tuple[int,
 
 
 def touching(mask: Mask, seeds: Mask) -> Mask:
-    """The connected parts of a mask in which seeds lie. [h, w]"""
+    """Connected parts of a mask that contain seeds. [h, w]"""
     number, labels = cv2.connectedComponents(mask.astype(np.uint8))
     kept = np.bincount(labels.ravel(), seeds.ravel(), number) > 0
     kept[0] = False
@@ -212,16 +212,17 @@ def touching(mask: Mask, seeds: Mask) -> Mask:
 
 
 def filled(mask: Mask) -> Mask:
-    """A mask with all that it encloses. [h, w]"""
+    """A mask with its holes filled. [h, w]"""
     outside = ~np.pad(mask, 1)
     _, labels = cv2.connectedComponents(outside.astype(np.uint8), connectivity=4)
     return (labels != labels[0, 0])[1:-1, 1:-1]
 
 
 def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> Mask:
-    """Where a shot shows what moves in another one, by optical flow there and back. [h, w]
+    """Moving objects of another shot, tracked into a shot by optical flow there and back. [h, w]
 
-    Both look the same way first: optical flow finds what is near the same pixel, and turning the head shifts all.
+    Both are rotated to the same direction first: optical flow handles small displacements, and rotations shift all
+    pixels.
     """
     gray = shot.view.gray
     x, y, ahead = Warp.between(shot.view, other.view).places(np.zeros(gray.shape, np.float32))

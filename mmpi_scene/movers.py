@@ -18,7 +18,7 @@ from mmpi_scene.scene import Scene, tile_order
 from mmpi_scene.street import Street
 
 WALKING, DRIVING = 1.3, 8.0
-"""Metres a second; whoever films the street walks or drives too."""
+"""Speeds in metres a second; the camera walks or drives too."""
 LANE, PAVEMENT = 1.8, 7.6
 """Metres from the middle line at which cars drive, and people walk."""
 STRIDES, SWING = 0.95, 0.28
