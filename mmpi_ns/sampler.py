@@ -54,7 +54,7 @@ def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tens
 
 
 class LiveSamples(NamedTuple):
-    """A flat list of live samples: head by head, ray by ray, near to far."""
+    """Flat list of samples: head by head, ray by ray, near to far."""
 
     rays: Int[Tensor, "N"]
     heads: Int[Tensor, "N"]
@@ -219,7 +219,7 @@ def merge(
         counts: samples of each ray; S = counts.max().
 
     Returns:
-        Index of each slot's sample in the flat list (0 in empty slots), and which slots hold one.
+        Index of each slot's sample in the flat list (0 in empty slots), and mask of the occupied slots.
     """
     by_ray, width = torch.argsort(rays, stable=True), max(1, int(counts.max())) if counts.numel() else 1
     valid = torch.arange(width, device=rays.device) < counts[:, None]
@@ -242,7 +242,7 @@ def prune(
 
     Args:
         order: all samples, nearest first (see ``merge``).
-        valid: which slots hold one.
+        valid: mask of the occupied slots.
         tau: blended optical depth of the flat samples.
         threshold: weight below which a sample is dropped once the field has sharpened; 0 keeps all.
         fair_share: the bound relative to equal weights; inf for the threshold alone.

@@ -97,7 +97,7 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
 
     Arrays are read from the file at each access, so they take memory only while they are used, and changes to them are
     not kept. If several processes ask at once, one computes and the others wait. If the folder is not writable, every
-    process computes the result itself, and says so.
+    process computes the result and prints a note.
 
     ``find`` gives arrays by name; pairs that are computed one by one are written one by one.
     """

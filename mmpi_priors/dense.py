@@ -186,7 +186,7 @@ def _tasks(
     """Tasks that match and confirm images, in an order in which no thread waits for a later task; True: an image's last
     task.
 
-    An image is forgotten once all tasks that need it are submitted, which alone hold it then.
+    An image is released once all tasks that need it are submitted; they keep the only references.
     """
 
     def match(i: int, views: list[Future[View]]) -> Depth:

@@ -187,7 +187,7 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
 
 
 def with_continued(depths: DepthPriors, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> DepthPriors:
-    """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
+    """Depths with surfaces extrapolated into regions that hardly any other image sees (``lone_depth.py``); cached.
 
     Masked pixels get no distance: moving objects have no fixed position.
     """

@@ -105,7 +105,7 @@ def horizon_of(view: View, up: NDArray[np.float64]) -> NDArray[np.float64] | Non
 
 
 def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:
-    """Inverse depth of the plane on which most of the content stands; 0 near the horizon and above.
+    """Inverse depth of the ground plane; 0 near the horizon and above.
 
     Args:
         view: the image.

@@ -246,7 +246,7 @@ class TexelTables(Field):
         Args:
             lookup: of the samples in the tables.
             weights: of the samples.
-            live: samples of each ray.
+            live: number of samples of each ray before pruning.
             errors: squared errors of the rays' colours, 0 where a ray has none.
         """
         gain = self.gain if self.num_copies == 0 else None

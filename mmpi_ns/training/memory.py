@@ -72,7 +72,7 @@ def fit_memory(
         views_of: training images of a window.
         work: settings of the training.
         device: on which it will be trained.
-        again: plans anew with at most so many texels a window; None where a plan was asked for.
+        again: makes a plan with at most so many texels a window; None if a plan was given.
 
     Returns:
         ``windows`` if they fit, or planned again.

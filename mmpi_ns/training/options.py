@@ -82,8 +82,8 @@ NO_EFFECT = {
 def checked(config: MMPITrainerConfig) -> TrainerConfig:
     """Checks the options of a run and locks its folder; the settings for its config.yml.
 
-    They tell ns-eval and ns-render where the capture and the windows are, from whatever folder they are started, but
-    not which checkpoint this run resumes from, which they must not load.
+    They contain absolute paths of the capture and the windows for ns-eval and ns-render, but not the checkpoint that
+    this run resumes from, which these must not load.
     """
     check_run(config)
     checkpoint_to_load(config)

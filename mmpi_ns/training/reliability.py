@@ -1,16 +1,17 @@
 """The two-phase training of reliability, from its first step to its last (paper sec. III-C).
 
-``individual``: every MPI learns alone. A ray is rendered by one of the MPIs that it meets, or by each in turn, and by
-the cube (``assign_heads``). Training rays mark the texels that they read: there a head covers what it shows.
+``individual``: every MPI is trained alone. A ray is rendered by one of the MPIs that it intersects, or by each in turn,
+and by the cube (``assign_heads``). Training rays mark the texels that they read: a head covers points whose nearest
+texel is marked.
 
-``blend``: before its first step, texels that no ray has trained are emptied, so that they have no vote
+``blend``: before its first step, texels that no ray has trained are emptied, so that they have no share
 (``release_untrained``). Then all heads render each ray, blended by reliability (``mmpi_ns/blending.py``), and only
-reliability trains. No texel is marked any more, so that P cannot jump.
+reliability trains. Texels are no longer marked, so that P is continuous in time.
 
-``finetune``: all parameters train together, rendered likewise (ours).
+``finetune``: all parameters train together, rendered likewise (not in the paper).
 
 ``joint`` training has one phase of that name, in which all heads render each ray, each MPI with 1/K of the optical
-depth, and nothing is blended. A scene of one head has nothing to blend with and trains like this.
+depth, without blending. A scene of one head trains like this.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def phase_lengths(total_steps: int, blend_share: float, finetune_share: float) -
 
 
 def prepare_parameters(field: MMPIField, groups: Mapping[str, Sequence[Parameter]], phase: str) -> None:
-    """Freezes what a phase does not train, before each step.
+    """Freezes the parameters that a phase does not train, before each step.
 
     Args:
         field: marks the texels that training rays read while MPIs train alone.
@@ -59,7 +60,8 @@ def prepare_parameters(field: MMPIField, groups: Mapping[str, Sequence[Parameter
 
 
 def release_untrained(field: TexelTables, phase: str, is_first_step: bool) -> list[Int[Tensor, "K"] | None]:
-    """Empties what no ray has trained before the first step of blending; bricks that remain, as ``release_unused``."""
+    """Empties untrained texels before the first step of blending; returns the remaining bricks as
+    ``release_unused``."""
     return [field.release_untouched()] if phase == "blend" and is_first_step else []
 
 
@@ -78,12 +80,12 @@ def assign_heads(
         plan: of the scene, of K MPIs and H heads.
         phase: by name.
         rays_per_mpi: while MPIs train alone, each ray is for one of them (split) or for every one in turn (all).
-        draws: the one of a ray.
+        draws: generators of the assignment.
         step: of the training.
 
     Returns:
         The rays, all of them again for every MPI where each renders all; heads that may render each ray, None for all;
-        and priorities of the MPIs, of which the first that a ray meets renders it, None for all.
+        and priorities of the MPIs: the highest among those that a ray intersects renders it, None for all.
     """
     count, num_mpis, device = len(ray_bundle), len(plan.mpis), ray_bundle.origins.device
     if phase != "individual" or num_mpis == 1:
@@ -98,5 +100,5 @@ def assign_heads(
 
 
 def blends_in(phase: str, field: MMPIField) -> bool:
-    """Whether a phase renders the heads of a field blended by reliability."""
+    """Whether a phase blends the heads of a field by reliability."""
     return "reliability" in TRAINS[phase] and field.blends
