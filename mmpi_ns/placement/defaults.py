@@ -8,13 +8,16 @@ from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import Number, check_options, shown
 
 STEPS, LEAST_STEPS, RAYS = 4000, 2500, 1024
-"""Training steps of a capture of ``FEW`` to ``MANY`` pixels, minimum for one of fewer pixels, and rays of a step. More
-rays improve the field, but not images with details: the field overfits single images (docs/ablations.md)."""
+"""Training steps of a capture of ``FEW`` to ``MANY`` pixels, minimum for one of fewer pixels, and rays of a step:
+minutes on a CPU."""
 PLACEMENT = PlacementConfig(texel_pixels=1.2)
 FEW, MANY = 2.6e6, 10.4e6
 """Training pixels of a window below which steps decrease in proportion, and above which they increase."""
 MOST_TIMES = 3.0
 """Largest multiple of the steps."""
+GPU_MULTIPLE, RAYS_PER_PIXEL = 4.0, 4.0
+"""Factor on the rays of a run on a GPU, up to so many per training pixel: beyond, images do not improve
+(docs/results/README.md, "Longer and shorter")."""
 RAYS_PER_PROCESSOR = 256
 """Pixel rays of a step per multiprocessor of a GPU. Its registers hold eight programs of the march, of 16 rays each, so
 these and the rays of new views take about three rounds."""
@@ -43,9 +46,12 @@ def rays_times(processors: int) -> int:
 
 def steps_for(pixels: float, size: float = 1.0, times: int = 1) -> int:
     """Training steps of a window, in hundreds, by its training pixels (``FEW``, ``MANY``), multiplied by ``size`` and
-    divided by ``times``, the factor on the rays per step (``rays_times``)."""
-    multiple = min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES)
-    return 100 * max(1, round(size * max(LEAST_STEPS, STEPS * multiple) / 100)) // times
+    divided by ``times``, the factor on the rays per step (``rays_times``). A GPU, whose ``times`` are above 1, takes
+    more rays (``GPU_MULTIPLE``)."""
+    steps = max(LEAST_STEPS, STEPS * min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES))
+    if times > 1:
+        steps = min(GPU_MULTIPLE * steps, max(steps, RAYS_PER_PIXEL * pixels / RAYS))
+    return 100 * max(1, round(size * steps / 100)) // times
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:

@@ -44,11 +44,12 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     ("processors", "rays"),
     [(0, 1024), (4, 1024), (8, 2048), (28, 4096), (132, 4096)],  # CPU, 3060, T4 ...
 )
-def test_a_larger_gpu_draws_more_rays_a_step_and_as_many_in_all(processors, rays):
+def test_a_larger_gpu_draws_more_rays_a_step_and_in_all_up_to_four_a_pixel(processors, rays):
     times = rays_times(processors)
     assert times * RAYS == rays
-    for pixels in (1.0, 2.5 * MANY):
-        assert times * steps_for(pixels, times=times) == steps_for(pixels)
+    for pixels, multiple in ((1.0, 1), (0.25 * FEW, 1), (0.6 * FEW, 6100 / 2500), (MANY, 4), (2.5 * MANY, 4)):
+        expected = steps_for(pixels) * (multiple if times > 1 else 1)
+        assert times * steps_for(pixels, times=times) == pytest.approx(expected, abs=times)
     whole, fewer = (make_schedule(ScheduleConfig(), 2000 // n) for n in (1, times))
     assert [abs(times * a - b) < times for a, b in zip(fewer.growth, whole.growth, strict=True)] == [True] * 4
 
