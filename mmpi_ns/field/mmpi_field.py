@@ -25,7 +25,6 @@ from mmpi_ns.ops.gather import RaySums, Taps, activate, gather_places, gather_ta
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MergedSamples
-from mmpi_ns.ops.shade import head_colors, shade
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.geometry import FACING_EPS, LocalRays, sample_disparity
@@ -253,17 +252,14 @@ class MMPIField(TexelTables):
         Args:
             rays: of the samples.
             samples: of the rays.
-            lookup: of the samples in the tables; None computes it if gradients are enabled.
+            lookup: of the samples in the tables; None computes it.
             chosen: as for ``render_colors``.
         """
         directions, axes = rays.directions, self.layout.frames.axes
         assert isinstance(self.networks, ColorNetworks), "rays that are shaded once have no colours of samples"
-        # A copy has its MPI's network.
-        networks = self.networks.of_heads(self.planned_heads(torch.arange(self.plan.num_heads)).tolist())
+        networks = self.planned_heads(torch.arange(self.plan.num_heads)).tolist()  # a copy has its MPI's network
         if self.layout.cube is not None:
             axes = torch.cat([axes, torch.eye(3, device=axes.device)[None]])
-        if lookup is None and not torch.is_grad_enabled():
-            return shade(self.layout, self.features.data, networks, axes, directions, samples.places)
         lookup = lookup or self._lookup(rays, samples)
         out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
         colors, slots = [out[:0]], [lookup.index[:0]]
@@ -274,7 +270,8 @@ class MMPIField(TexelTables):
                 kept = chosen[of_samples[2]].nonzero()[:, 0]
                 of_samples = tuple(x.index_select(0, kept) for x in of_samples)
             values, ndc, numbers, index = of_samples
-            colors.append(head_colors(networks, k, values, ndc, geometry.rotate(axes[k], directions), numbers))
+            in_axes = geometry.rotate(axes[k], directions)
+            colors.append(self.networks.shade(networks[k], values, ndc, in_axes, numbers))
             slots.append(index)
         return out.index_copy(0, torch.cat(slots), torch.cat(colors)).view(*lookup.shape, 3)
 

@@ -7,15 +7,13 @@ network shades the ray once. ``sample``: a network gives every sample its colour
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mmpi_ns.field.tables import replace_data
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.ops.shade import Layers, SampleNetworks, positional_encoding, run_layers
 
 CHANGE = 4.0
 """Change of the log odds of a colour for each unit of network output: a middle grey then changes by one unit."""
@@ -54,21 +52,50 @@ class Networks(nn.Module):
             parts.append((torch.rand(math.prod(shape), generator=generator) * 2 - 1) * bound)
         replace_data(self.weights, torch.cat(parts).repeat(count, 1).to(self.weights.device))
 
-    def layers(self, head: int) -> Layers:
-        """Three layers of one head's network."""
-        parts = self.weights[head].split([math.prod(s) for s in self.shapes])
-        return Layers(*(p.view(s) for p, s in zip(parts, self.shapes, strict=True)))
+    def layers(self, number: int) -> list[Tensor]:
+        """Weights and biases of the three layers of one network."""
+        parts = self.weights[number].split([math.prod(s) for s in self.shapes])
+        return [p.view(s) for p, s in zip(parts, self.shapes, strict=True)]
+
+    def run(self, number: int, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
+        """Outputs of one network."""
+        w1, b1, w2, b2, w3, b3 = self.layers(number)
+        hidden = torch.nn.functional.linear(inputs, w1, b1).relu_()
+        hidden = torch.nn.functional.linear(hidden, w2, b2).relu_()
+        return torch.nn.functional.linear(hidden, w3, b3)
+
+
+def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tensor, "N E"]:
+    """(x, sin 2^i pi x, cos 2^i pi x) for i < frequencies (NeRF eq. 4)."""
+    octaves = math.pi * 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)
+    angles = (x[:, None, :] * octaves[:, None]).flatten(1)
+    return torch.cat([x, angles.sin(), angles.cos()], -1)
 
 
 class ColorNetworks(Networks):
-    """Networks (features, PE(position), PE(direction)) -> rgb for every sample, one for each head.
+    """Networks (features, PE(position), PE(direction)) -> rgb for every sample, one for each head."""
 
-    The first three features are colour logits, to which the network adds the view-dependent part.
-    """
+    def shade(
+        self,
+        number: int,
+        features: Float[Tensor, "N C"],
+        ndc: Float[Tensor, "N 3"],
+        directions: Float[Tensor, "R 3"],
+        rays: Int[Tensor, "N"],
+    ) -> Float[Tensor, "N 3"]:
+        """Colours in [0, 1] of samples of one head: the first three features are their logits, to which the network
+        adds the view-dependent part.
 
-    def of_heads(self, numbers: Sequence[int]) -> SampleNetworks:
-        """Networks of heads, given the number of each head's network."""
-        return SampleNetworks(tuple(self.layers(k) for k in numbers), *self.frequencies)
+        Args:
+            number: of the head's network.
+            features: of each sample.
+            ndc: position of each sample.
+            directions: of each ray, in the head's axes; encoded once a ray.
+            rays: ray of each sample.
+        """
+        position = positional_encoding(ndc, self.frequencies[0])
+        direction = positional_encoding(directions, self.frequencies[1]).index_select(0, rays)
+        return torch.sigmoid(features[:, :3] + self.run(number, torch.cat([features, position, direction], -1)))
 
 
 class RayShader(Networks):
@@ -92,7 +119,7 @@ class RayShader(Networks):
         """
         mean = gathered / mass.clamp(min=LEAST_MASS)
         encoded = positional_encoding(directions, self.frequencies[0])
-        said = run_layers(self.layers(0), torch.cat([mean, encoded], -1))
+        said = self.run(0, torch.cat([mean, encoded], -1))
         return accumulation * change_odds(mean[:, :COLORS], said)
 
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from mmpi_ns.field.shading import ColorNetworks
-from mmpi_ns.ops.shade import head_colors
 
 
 def normal(*shape, seed=0):
@@ -52,11 +51,9 @@ def batch(channels, width, octaves, count):
 )
 def test_colours_and_their_gradients_equal_float64(channels, width, octaves, count):
     networks, features, *places = batch(channels, width, octaves, count)
+    ndc, directions, rays = places
     given, exact, grad = features.clone().requires_grad_(), features.double().requires_grad_(), normal(count, 3, seed=4)
-    found, wanted = (
-        head_colors(networks.of_heads(range(3)), 1, given, *places),
-        by_formula(networks, 1, exact, *places, octaves),
-    )
+    found, wanted = networks.shade(1, given, *places), by_formula(networks, 1, exact, ndc, directions, rays, octaves)
     assert found.shape == (count, 3) and torch.allclose(found.double(), wanted, atol=2e-6)
     sums = [(found * grad).sum(), (wanted * grad).sum()]
     mine = torch.autograd.grad(sums[0], [given, networks.weights])
@@ -68,15 +65,12 @@ def test_colours_and_their_gradients_equal_float64(channels, width, octaves, cou
 
 def test_encoded_once_a_ray_or_once_a_sample_a_direction_gives_the_same_colour():
     networks, features, ndc, directions, rays = batch(4, 8, (2, 2), 6)
-    of_heads = networks.of_heads(range(3))
-    once = head_colors(of_heads, 1, features, ndc, directions, rays)
-    each = head_colors(of_heads, 1, features, ndc, directions[rays], torch.arange(6))
+    once = networks.shade(1, features, ndc, directions, rays)
+    each = networks.shade(1, features, ndc, directions[rays], torch.arange(6))
     assert torch.allclose(once, each, atol=1e-7)
 
 
 def test_colours_say_where_a_feature_is_not_a_number():
     networks, features, *places = batch(9, 32, (2, 2), 40)
     features[7, 5] = math.nan
-    assert head_colors(networks.of_heads(range(3)), 1, features, *places).isnan().any(
-        -1
-    ).nonzero().flatten().tolist() == [7]
+    assert networks.shade(1, features, *places).isnan().any(-1).nonzero().flatten().tolist() == [7]
