@@ -64,7 +64,7 @@ def adjust(
     """Bundle adjustment of points, and of what is named, over all images with a robust loss, in place; ``lens`` is
     distortion and, if ``focal``, focal length."""
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
-    options.refine_rig_from_world = poses
+    options.refine_rig_from_world, options.refine_sensor_from_rig = poses, False
     options.refine_focal_length, options.refine_extra_params = lens and focal, lens
     options.refine_principal_point = principal_point
     options.print_summary = False

@@ -105,18 +105,20 @@ class Agreement:
 
 def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
     """The evidence on a mapper's model, which has the keypoints of the database; ``offered`` are the names of all
-    images of the capture in order.
+    images of the capture in order. Images of one frame of a rig count as the first of them.
 
     A lens has no ray for a pixel beyond its largest image radius (COLMAP returns NaN): matches there fit nothing.
     """
     names, poses = camera_poses(model)
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    frames = list(dict.fromkeys(image.frame_id for image in images))
+    place = {image.image_id: frames.index(image.frame_id) for image in images}
     points = {  # the point that each keypoint sees, -1 for none
         image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64)
         for image in images
     }
     rays, observations = {}, []  # rays in the camera, with z = 1
-    for n, (image, pose) in enumerate(zip(images, poses, strict=True)):
+    for image, pose in zip(images, poses, strict=True):
         pixels = np.array([p.xy for p in image.points2D], dtype=np.float64).reshape(-1, 2)
         rays[image.image_id] = np.asarray(model.cameras[image.camera_id].cam_from_img(pixels)).reshape(-1, 2)
         seen = points[image.image_id]
@@ -124,10 +126,9 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         directions = np.c_[rays[image.image_id], np.ones(len(seen))][certain] @ pose[:3, :3].T
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         center = np.tile(pose[:3, 3], (len(directions), 1))
-        observations.append((seen[certain], np.full(len(directions), n), center, directions))
-    points_seen, frames, centers, directions = (np.concatenate(column) for column in zip(*observations, strict=True))
-    place, rows = {image.image_id: n for n, image in enumerate(images)}, []  # of pairs of registered images
-    matched, fits = [], []
+        observations.append((seen[certain], np.full(len(directions), place[image.image_id]), center, directions))
+    points_seen, places, centers, directions = (np.concatenate(column) for column in zip(*observations, strict=True))
+    rows, matched, fits = [], [], []  # of pairs of registered images
     for a, b, matches in verified_matches(database):
         if a not in place or b not in place or len(matches) < MIN_INLIERS:
             continue
@@ -143,7 +144,8 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         matched.append(matched_rays)
         fits.append(fit)
     table = np.array(rows, dtype=np.int64).reshape(-1, 6)
-    low, high = table[:, :2].min(1, initial=len(place)), table[:, :2].max(1, initial=0)
+    low, high = table[:, :2].min(1, initial=len(frames)), table[:, :2].max(1, initial=0)
+    names, poses = names[: len(frames)], poses[: len(frames)]  # those of the first sensor come first
     camera, order = model.cameras[images[0].camera_id], {image: i for i, image in enumerate(offered)}
     return Witness(
         name,
@@ -152,7 +154,7 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         poses,
         Pairs(low, high, *table[:, 2:].T.astype(np.float64)),
         camera.mean_focal_length() / max(camera.width, camera.height),
-        scale_changes(points_seen, frames, centers, directions, len(names)),
+        scale_changes(points_seen, places, centers, directions, len(names)),
         says,
         model,
         turns_explain(matched, fits),

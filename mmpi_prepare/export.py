@@ -83,7 +83,7 @@ def transforms(
         size = {"w": model.cameras[number].width, "h": model.cameras[number].height}
         entry = dict(zip(("fl_x", "fl_y", "cx", "cy"), values[:4], strict=True)) | size
         entries[number] = entry | dict(zip(keys, values[4:], strict=True))
-    is_shared = len(entries) == 1
+    is_shared = len({tuple(entry.values()) for entry in entries.values()}) == 1
     camera_of = {image.name: image.camera_id for image in model.images.values()}
     frames = []
     for name, pose in sorted(zip(*camera_poses(model), strict=True), key=lambda pair: pair[0]):

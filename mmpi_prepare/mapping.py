@@ -212,6 +212,7 @@ def mapper_options(
         setattr(mapper, name, value)
     options.triangulation.min_angle = attempt.min_angle
     options.ba_refine_focal_length = options.ba_refine_extra_params = refine
+    options.ba_refine_sensor_from_rig = False
     options.ba_global_function_tolerance = options.ba_local_function_tolerance = STILL
     if is_large:
         options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
@@ -245,6 +246,7 @@ def map_globally(
         mapper.track_required_tracks_per_view = TRACKS_PER_VIEW
         mapper.min_tri_angle_deg, mapper.skip_retriangulation = MIN_ANGLE, True
         mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = refine
+        mapper.refine_sensor_from_rig = mapper.bundle_adjustment.refine_sensor_from_rig = False
         models = pycolmap.global_mapping(database, task.images, folders, options)
         for number, model in models.items():
             (folders / str(number)).mkdir(exist_ok=True)

@@ -8,7 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from mmpi_ns.utils.errors import FULL, InputError, looked_at, progress, quoted, say
 from mmpi_ns.utils.files import whole, write_text
 from mmpi_ns.utils.values import check_options
-from mmpi_prepare import checks, export, features, images
+from mmpi_prepare import checks, export, features, images, panoramas
 from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_known_poses
 from mmpi_prepare.depths import find_depths, metres_of, write_depths
 from mmpi_prepare.gps import Fit, find_fit
@@ -35,8 +35,8 @@ from mmpi_priors.sfm import load_pycolmap, match_pairs, new_model, quiet, rigid3
 from mmpi_priors.tracks import near_pairs
 
 WORK = ".prepare"
-WORDS = {"input": "reading", "masks": "reading", "features": "features", "matches": "matching", "model": "mapping"}
-"""The stages in words, for the times in the report."""
+WORDS = {"features": "features", "matches": "matching", "model": "mapping"}
+"""The stages in words, for the times in the report; the others read."""
 LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 LEAST_IMAGES = 3
@@ -115,7 +115,8 @@ class Preparation:
             folder.mkdir(exist_ok=True)
             state["result"] = make(folder)
             write_text(stamp, json.dumps(state))
-        self.times[WORDS[name]] = self.times.get(WORDS[name], 0.0) + time.monotonic() - start
+        words = WORDS.get(name, "reading")
+        self.times[words] = self.times.get(words, 0.0) + time.monotonic() - start
         return folder, state["result"]
 
     def _read(self) -> None:
@@ -136,6 +137,14 @@ class Preparation:
         if s.masks is not None:
             stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
             self.masks, _ = self._stage("masks", stamps, partial(images.gather_masks, s.masks, self.photos))
+        how = self.image_folder, self.photos, self.masks
+        folder, faces = self._stage("faces", [], lambda folder: [asdict(p) for p in panoramas.cut(*how, folder)])
+        self.panoramas = len(self.photos) if faces else 0
+        if faces:
+            panoramas.check(s)
+            self.photos, self.image_folder = [Photo(**face) for face in faces], folder / "images"
+            self.settings = s = replace(s, camera=(self.photos[0].width / 2,) * 3)
+            self.masks, self.is_video = folder / "masks" if self.masks else None, False
         self.depths = find_depths(s.depths, self.photos) if s.depths is not None else {}
         self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
         if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
@@ -167,6 +176,8 @@ class Preparation:
         if not database.exists():
             with whole(database) as unfinished:
                 shutil.copyfile(unmatched, unfinished)
+                if self.panoramas:
+                    panoramas.join(unfinished)
         if self.known_poses is not None and s.matching == "auto":
             places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
             poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
@@ -177,6 +188,8 @@ class Preparation:
         else:
             alike = features.image_similarity(database, len(names))
             pairs, says = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
+        if self.panoramas:  # faces of one panorama have nothing in common
+            pairs = [(i, j) for i, j in pairs if (j - i) % self.panoramas]
         with progress("Matching pairs", len(pairs)) as advance:
             for start in range(0, len(pairs), features.PAIR_BATCH):  # but for those matched before
                 batch = [(names[i], names[j]) for i, j in pairs[start : start + features.PAIR_BATCH]]
@@ -294,7 +307,8 @@ class Preparation:
             return export.split_images(names, lists=read_lists(s.split_from), source=s.split_from.name)
         if self.known_poses is not None and self.known_poses.split and s.test_every is None and s.train_every is None:
             return export.split_images(names, lists=self.known_poses.split, source=f"{s.poses}")
-        return export.split_images(names, s.test_every, s.train_every)
+        split = panoramas.split_panoramas if self.panoramas else export.split_images
+        return split(names, s.test_every, s.train_every)
 
     def _check(
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split, built: Path

@@ -250,6 +250,7 @@ def triangulate_points(
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
     options.mapper.filter_max_reproj_error = max_error
     options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    options.ba_refine_sensor_from_rig = False
     with tempfile.TemporaryDirectory(prefix="mmpi-points-") as unread:
         return pycolmap.triangulate_points(model, database, images, unread, clear_points=True, options=options)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -47,6 +47,8 @@ class SceneCommand:
     exposure: ExposureName = "none"
     """auto: gains that follow the content (three-fold), white balance, vignetting and a tone curve, written to
     exposure.json. vignetting: one exposure, half of the light lost in the corners."""
+    panorama: bool = False
+    """Equirectangular views, --width pixels wide and half as high, without points and depths: for mmpi-prepare."""
     moving: int = 0
     """Number of cars and people that move through a street; exact masks in moving/. Test images are rendered without
     them."""
@@ -60,6 +62,7 @@ class SceneCommand:
 
         from mmpi_ns.utils.files import make_writable
         from mmpi_ns.utils.values import Number, check_options
+        from mmpi_scene.cameras import Panoramas
         from mmpi_scene.catalogue import make_scene
         from mmpi_scene.dataset import check_folder, make_exposure, write_dataset
         from mmpi_scene.movers import with_movers
@@ -73,20 +76,28 @@ class SceneCommand:
         check_options(self, {name: r for name, r in ranges.items() if getattr(self, name) is not None}, "--")
         check_folder(self.folder, self.overwrite)
         scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)
+        if self.panorama:
+            if self.height is not None:
+                raise ValueError("Panoramas are half as high as wide: leave --height out.")
+            scene = replace(scene, cameras=Panoramas.of(scene.cameras))
         make_writable(self.folder, "folder")
         if self.moving:
             scene = with_movers(scene, self.moving)
         cameras, points = scene.cameras, self.points or max(4000, 4 * round(self.length or 0))
+        points = 0 if self.panorama else points
         print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
         processes = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         sfm = write_dataset(
             scene, self.folder, points, self.noise, self.outliers, self.images, self.overwrite,
-            partial(track, description="Rendering"), exposure=make_exposure(self.exposure, scene), processes=processes,
+            partial(track, description="Rendering"), not self.panorama, make_exposure(self.exposure, scene), processes,
         )  # fmt: skip
         test = int(cameras.is_test.sum())
-        kind = "images with depths" if self.images else "cameras (no images)"
+        kind = "panoramas" if self.panorama else "images with depths" if self.images else "cameras (no images)"
         print(f"Wrote {self.folder}: {len(cameras)} {kind} of {cameras.width}x{cameras.height} pixels,")
         print(f"  {len(cameras) - test} to train with and {test} to test with;")
+        if self.panorama:
+            print(f"Next: mmpi-prepare {quoted(self.folder / 'images')} scene/")
+            return
         print(
             f"  {len(sfm.points)} points in {len(sfm.camera)} keypoints, {int(sfm.outlier.sum())} points wrong,"
             " in colmap/sparse/0 and sparse_pc.ply."

@@ -107,3 +107,21 @@ class Cameras:
             shrink = np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True) / widest, 1)
             tangents = self._distort(tangents / shrink)[0] * shrink
         return tangents * self.focal + self.center, depth
+
+
+@dataclass(frozen=True)
+class Panoramas(Cameras):
+    """M equirectangular views, twice as wide as high: ahead is in the middle, the tangents of a pixel are its angles to
+    the right and downwards, and ``focal`` is pixels a radian. There is no ``project``."""
+
+    @classmethod
+    def of(cls, cameras: Cameras) -> Panoramas:
+        """As wide views as others, from the same places."""
+        width, height = cameras.width // 2 * 2, cameras.width // 2
+        return cls(cameras.camera_to_worlds, width / (2 * np.pi), width, height, cameras.test_every)
+
+    def rays_at(self, camera: int, tangents: Array) -> tuple[Array, Array]:
+        pose, (right, down) = self.camera_to_worlds[camera], tangents.T
+        local = np.stack([np.cos(down) * np.sin(right), -np.sin(down), -np.cos(down) * np.cos(right)], -1)
+        directions = local @ pose[:, :3].T
+        return np.broadcast_to(pose[:, 3], directions.shape), directions

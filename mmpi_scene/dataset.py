@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_scene.cameras import Array, Cameras
+from mmpi_scene.cameras import Array, Cameras, Panoramas
 from mmpi_scene.movers import moving_mask
 from mmpi_scene.scene import Colors, Scene, render
 from mmpi_scene.sfm_like import SfmPoints, sfm_points
@@ -175,7 +175,8 @@ def _write_image(camera: int) -> None:
         seconds = Fraction(SECONDS * exposure.gains[camera, 1]).limit_denominator(10**6)  # by the gain of green
         exif[0x8769] = {33434: float(seconds), 33437: APERTURE, 34855: SPEED}  # its own directory: time, f-number, ISO
     Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / name, exif=exif)
-    write_depths(scene, folder, camera, distances)
+    if not isinstance(scene.cameras, Panoramas):
+        write_depths(scene, folder, camera, distances)
     if scene.movers is not None:
         Image.fromarray(moving_mask(scene, camera)).save(folder / "moving" / name)
 
@@ -186,6 +187,7 @@ def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> 
     slant = np.sqrt(1 + (scene.cameras.central_tangents**2).sum(-1)).reshape(distances.shape)
     depths = 1000 * distances / slant
     millimetres = np.where(depths <= MILLIMETRES, depths, 0).round().astype(np.uint16)
+    (folder / "depths").mkdir(exist_ok=True)
     Image.fromarray(millimetres).save(folder / "depths" / image_name(camera))
 
 
@@ -202,7 +204,7 @@ def _write_images(
 ) -> None:
     """Renders and writes all images, by forked processes if there are several and the system can fork."""
     global _writing
-    for part in ("images", "depths", *(["moving"] if scene.movers else [])):
+    for part in ("images", *(["moving"] if scene.movers else [])):
         (folder / part).mkdir()
     _writing, count = (scene, folder, exposure), len(scene.cameras)
     if min(processes, count) < 2 or "fork" not in get_all_start_methods():
@@ -242,21 +244,22 @@ def clear(folder: Path) -> None:
 
 
 def _transforms(scene: Scene, images: bool) -> dict:
-    cameras = scene.cameras
-    frames = []
+    cameras, frames = scene.cameras, []
+    is_round = isinstance(cameras, Panoramas)
+    focal = np.pi * cameras.focal if is_round else cameras.focal  # nerfstudio's is half the width of a panorama
     for i, pose in enumerate(cameras.camera_to_worlds):
         frame = {"file_path": f"images/{image_name(i)}", "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
-        frames.append(frame | ({"depth_file_path": f"depths/{image_name(i)}"} if images else {}))
+        frames.append(frame | ({"depth_file_path": f"depths/{image_name(i)}"} if images and not is_round else {}))
     test = cameras.is_test
     names = {split: [f["file_path"] for f, t in zip(frames, test, strict=True) if t == held] for split, held in
              (("train", False), ("val", True), ("test", True))}  # fmt: skip
     return {
-        "camera_model": "OPENCV",
-        "fl_x": cameras.focal, "fl_y": cameras.focal, "cx": cameras.center[0], "cy": cameras.center[1],
+        "camera_model": "EQUIRECTANGULAR" if is_round else "OPENCV",
+        "fl_x": focal, "fl_y": focal, "cx": cameras.center[0], "cy": cameras.center[1],
         "w": cameras.width, "h": cameras.height,
         **dict(zip(("k1", "k2", "p1", "p2"), cameras.distortion, strict=True)),
         "applied_transform": np.eye(4)[:3].tolist(),
-        "ply_file_path": "sparse_pc.ply",
+        **({} if is_round else {"ply_file_path": "sparse_pc.ply"}),
         "scene": {"name": scene.name, "seed": scene.seed},
         **{f"{split}_filenames": files for split, files in names.items()},
         "frames": frames,

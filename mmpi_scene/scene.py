@@ -76,7 +76,7 @@ class Scene:
         """Distance [R] (inf: the sky) and row of the primitive that is hit [R], -1 for ground and sky."""
         distance, row = self.tracer(origins, directions)
         down = directions[:, 2]
-        ground = np.where(down < -1e-12, -origins[:, 2] / np.where(down < -1e-12, down, -1.0), np.inf)
+        ground = np.where(down < -1e-9, -origins[:, 2] / np.where(down < -1e-9, down, -1.0), np.inf)
         below = (ground > 1e-6) & (ground < distance)
         return np.where(below, ground, distance), np.where(below, -1, row)
 
