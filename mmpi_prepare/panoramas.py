@@ -127,7 +127,8 @@ def join(database: Path) -> None:
 
 def split_panoramas(names: Sequence[str], test_every: int | None, train_every: int | None) -> Split:
     """As ``split_images``, with all faces of a panorama on one side."""
-    split = split_images([n for n in names if n.startswith("front-")], test_every, train_every)
-    train, test = ({n.partition("-")[2] for n in fronts} for fronts in (split.train, split.test))
-    sides = (tuple(n for n in names if n.partition("-")[2] in some) for some in (train, test))
-    return Split(*sides, f"of the panoramas, {split.says}")
+    fronts = split_images([n for n in names if n.startswith("front-")], test_every, train_every)
+    train, test = (
+        tuple(n for n in names if f"front-{n.partition('-')[2]}" in side) for side in (fronts.train, fronts.test)
+    )
+    return Split(train, test, f"of the panoramas, {fronts.says}")

@@ -147,9 +147,10 @@ class Preparation:
             self.masks, self.is_video = folder / "masks" if self.masks else None, False
         self.depths = find_depths(s.depths, self.photos) if s.depths is not None else {}
         self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
-        if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
+        count = self.panoramas or len(self.photos)
+        if self.known_poses is None and count < LEAST_IMAGES:
             raise InputError(
-                f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
+                f"Poses cannot be found for {count} images alone, as no third confirms them: take more "
                 "(better twenty), or give known poses (--poses)."
             )
         # What is impossible is refused before the work.
