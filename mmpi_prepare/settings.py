@@ -23,7 +23,7 @@ class Settings:
     """
 
     input: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="INPUT")]
-    """Folder of images, or a video."""
+    """Folder of images or panoramas, or a video."""
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder for the scene."""
     masks: Path | None = None
