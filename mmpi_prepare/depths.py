@@ -3,6 +3,7 @@ them (``depth_file_path``, thousandths of a scene unit along the optical axis, 0
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.utils.errors import InputError, brief, progress
+from mmpi_ns.utils.errors import InputError, brief, progress, say
 from mmpi_ns.utils.files import whole
 from mmpi_prepare.images import Photo, in_short
 from mmpi_prepare.poses import KIND
@@ -25,6 +26,10 @@ SHAPE = 0.02
 colour cameras have other sizes, but depths must be registered to the colours."""
 THOUSAND = 1000.0
 """Values of a depth image for one scene unit: nerfstudio's ``depth_unit_scale_factor`` of 0.001."""
+STAMP, LAG = re.compile(r"\d+\.\d+"), 0.02
+"""Names of the files of TUM's RGB-D captures, in seconds, and the largest time between an image and its depths."""
+TUM = 0.2
+"""Millimetres of a value of a depth image there: a folder with depth.txt beside it."""
 LEAST, SPREAD = 100, 0.1
 """SfM points with a depth, at least, and median difference of their depths from the model's, at most: sensors have 0.01
 to 0.03, depths of other images and disparities 0.3."""
@@ -32,21 +37,29 @@ to 0.03, depths of other images and disparities 0.3."""
 
 def find_depths(folder: Path, photos: Sequence[Photo]) -> dict[str, Path]:
     """The depth image of each photo, by name of the photo: a.png or a.npy for a.jpg, or frame-1.depth.png for
-    frame-1.color.jpg. Raises InputError if one is missing, is no depth image, or has another shape."""
+    frame-1.color.jpg; where names are time stamps, the nearest, and photos that none is near are left out. Raises
+    InputError if one is missing, or most are not near, or one is no depth image, or has another shape."""
     files = [p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.suffix.lower() in KINDS]
     often = Counter(_bare(p.name) for p in files)
     by_name = {_bare(p.name): p for p in files if often[_bare(p.name)] == 1} | {_bare(p): p for p in files}
+    times = {float(name): p for name, p in by_name.items() if STAMP.fullmatch(name)}
     found: dict[str, Path] = {}
     for photo in photos:
         names = _bare(photo.source), _bare(Path(photo.source).name)  # with its folders, if several files have the name
         if name := next((n for n in names if n in by_name), None):
             found[photo.name] = folder / by_name[name]
-    if missing := [p.name for p in photos if p.name not in found]:
+        elif times and STAMP.fullmatch(names[1]):
+            nearest = min(times, key=lambda time: abs(time - float(names[1])))
+            found |= {photo.name: folder / times[nearest]} if abs(nearest - float(names[1])) <= LAG else {}
+    missing = [p.name for p in photos if p.name not in found]
+    if missing and times and len(found) > len(missing):
+        say(f"{len(missing)} images have no depths within {LAG} s: left out ({in_short(missing)}).", "yellow")
+    elif missing:
         raise InputError(
             f"--depths {folder} has no depth image for {len(missing)} of {len(photos)} images ({in_short(missing)}): "
             "give all of them one, named alike (a.png or a.npy for a.jpg)."
         )
-    for photo in photos:
+    for photo in (p for p in photos if p.name in found):
         height, width = read_millimetres(found[photo.name]).shape
         if abs(width / height * photo.height / photo.width - 1) > SHAPE:
             raise InputError(
@@ -60,9 +73,13 @@ def _bare(path: Path | str) -> str:
     return KIND.sub("", Path(path).with_suffix("").as_posix())
 
 
+def _is_tum(file: Path) -> bool:
+    return file.parent.with_name("depth.txt").is_file()
+
+
 def read_millimetres(file: Path) -> NDArray[np.float32]:
-    """Depths along the optical axis, millimetres [h, w]; 0 where unknown. Integers are millimetres, other numbers
-    metres. Raises InputError if a file is damaged, or is no depth image."""
+    """Depths along the optical axis, millimetres [h, w]; 0 where unknown. Integers are millimetres, or TUM's
+    units, other numbers metres. Raises InputError if a file is damaged, or is no depth image."""
     try:
         is_array = file.suffix.lower() == ".npy"
         depth = np.load(file) if is_array else cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -71,7 +88,7 @@ def read_millimetres(file: Path) -> NDArray[np.float32]:
         raise InputError(f"Depth image {file} cannot be read ({brief(error)}): repair or remove it.") from error
     if depth.ndim != 2 or depth.dtype.kind not in "uif" or depth.dtype.itemsize < 2:
         raise InputError(f"Depth image {file} is not one channel of depths: give a 16-bit PNG or a .npy file.")
-    depth = depth.astype(np.float32) * (np.float32(THOUSAND) if depth.dtype.kind == "f" else 1)
+    depth = depth.astype(np.float32) * np.float32(THOUSAND if depth.dtype.kind == "f" else TUM if _is_tum(file) else 1)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0)
 
 
@@ -124,7 +141,7 @@ def write_depths(
     with progress("Writing depths", len(photos)) as advance:
         for photo in photos:
             source, depth = files[photo.name], read_millimetres(files[photo.name]) * np.float32(units)
-            is_whole = units == 1 and source.suffix.lower() == ".png"
+            is_whole = units == 1 and source.suffix.lower() == ".png" and not _is_tum(source)
             name = f"{Path(photo.name).stem}{'.png' if is_whole else '.npy'}"
             for factor in (1, *factors):
                 rows, columns = (n // factor * factor for n in depth.shape)

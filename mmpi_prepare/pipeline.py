@@ -146,6 +146,7 @@ class Preparation:
             self.settings = s = replace(s, camera=(self.photos[0].width / 2,) * 3)
             self.masks, self.is_video = folder / "masks" if self.masks else None, False
         self.depths = find_depths(s.depths, self.photos) if s.depths is not None else {}
+        self.photos = [p for p in self.photos if not self.depths or p.name in self.depths]
         self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
         count = self.panoramas or len(self.photos)
         if self.known_poses is None and count < LEAST_IMAGES:

@@ -32,8 +32,8 @@ class Settings:
     """What to do about what moves in the training images, unless --masks are given: mask it in training, warn, or
     neither."""
     depths: Path | None = None
-    """Folder of depth images of an RGB-D camera, one for each image, named alike and registered to it: 16-bit PNG in
-    millimetres, or .npy in metres. They give the scale, unless --poses or --camera-height do."""
+    """Folder of depth images of an RGB-D camera, one for each image, named alike (or by time, as TUM's) and registered
+    to it: 16-bit PNG in millimetres, or .npy in metres. They give the scale, unless --poses or --camera-height do."""
     poses: Path | None = None
     """Known poses: a KITTI or TUM file, a transforms.json, or a folder of 4x4 text files."""
     poses_axes: Literal["auto", "opencv", "opengl"] = "auto"

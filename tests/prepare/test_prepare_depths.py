@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import corridor
@@ -13,8 +14,9 @@ from PIL import Image
 from mmpi_ns.data.dataset import read_depth_image
 from mmpi_ns.utils.errors import InputError
 from mmpi_prepare.depths import find_depths, read_millimetres
+from mmpi_prepare.depths import write_depths as write_depths_of_scene
 from mmpi_prepare.images import Photo
-from mmpi_prepare.pipeline import prepare
+from mmpi_prepare.pipeline import Preparation, prepare
 from mmpi_prepare.settings import Settings
 
 COUNT, POSES = 8, corridor.poses(8)
@@ -93,6 +95,31 @@ def test_depths_that_do_not_match_names_or_sizes_are_refused(tmp_path):
     for name in ("a", "b"):  # of two folders: those of the image's own
         write_depths(folder / name, POSES[:1])
     assert find_depths(folder, photos[:1]) == {photos[0].name: folder / "a/frame_001.png"}
+
+
+def test_depths_of_tum_are_the_nearest_in_time_and_those_without_are_left_out(frames, tmp_path, capsys):
+    for kind in ("rgb", "depth"):
+        (tmp_path / kind).mkdir()
+    for i, at in enumerate((0.0, 0.013, -0.019, 0.025, 0.0)):
+        shutil.copyfile(frames / f"frame_{i + 1:03d}.png", tmp_path / f"rgb/130503110{i}.175304.png")
+        values = np.full((corridor.HEIGHT, corridor.WIDTH), 5000 * (i + 1), np.uint16)
+        Image.fromarray(values).save(tmp_path / f"depth/{1305031100.175304 + i + at:.6f}.png")
+    (tmp_path / "depth.txt").write_text("# depth maps")
+    run = Preparation(Settings(tmp_path / "rgb", tmp_path / "scene", depths=tmp_path / "depth", focal=corridor.FOCAL))
+    run.work.mkdir(parents=True)
+    run._read()
+    assert [p.name[9] for p in run.photos] == ["0", "1", "2", "4"]
+    for photo in run.photos:
+        assert np.allclose(read_millimetres(run.depths[photo.name]), 1000 * (int(photo.name[9]) + 1))
+    assert "1 images have no depths within 0.02 s: left out (1305031103.175304.png)" in capsys.readouterr().out
+    files = write_depths_of_scene(run.depths, run.photos, 1.0, tmp_path / "built", [])
+    assert np.load(tmp_path / "built" / files[run.photos[1].name])[0, 0] == pytest.approx(2000)
+    (tmp_path / "depth.txt").unlink()
+    assert read_millimetres(run.depths[run.photos[1].name])[0, 0] == 10000
+    for file in sorted((tmp_path / "depth").iterdir())[:3]:
+        file.unlink()
+    with pytest.raises(InputError, match="no depth image for 4 of 5 images"):
+        run._read()
 
 
 def test_integers_are_millimetres_and_other_numbers_metres(tmp_path):
