@@ -107,8 +107,8 @@ def _header(run: Run, views: int) -> Image.Image:
     text = (
         f"This scene consists of {count}. Each is a stack of semi-transparent planes that face one way,\ndense near "
         "its origin (cross on the maps) and sparse far away. An MPI is sharp for views just past its origin: follow a "
-        "column down\nto see which one that is; it wins there. The rendering samples all MPIs along each ray and "
-        "composites the samples by distance.\nBlack dots are training cameras, A, B, ... the test views."
+        "column down\nto see which one that is; it has the largest weight there. The rendering samples all MPIs along "
+        "each ray and composites\nthe samples by distance. Black dots are training cameras, A, B, ... the test views."
     )
     header = Image.new("RGB", (LABELS + views * (VIEW + GAP) + GAP, 138), "white")
     draw = ImageDraw.Draw(header)
