@@ -1,7 +1,7 @@
 """Steps on a GPU, one operation at a time and as CUDA graphs, alternating in one process: a part of gpu_session.py.
 
-    python tests/gpu_steps.py costs --out FILE
-    python tests/gpu_steps.py mmpi-small --data CAPTURE --steps 1000 --stages 60 500 --out FILE
+    python benchmarks/gpu_steps.py costs --out FILE
+    python benchmarks/gpu_steps.py mmpi-small --data CAPTURE --steps 1000 --stages 60 500 --out FILE
 
 What it found is written after every stage.
 """

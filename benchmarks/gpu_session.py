@@ -1,7 +1,7 @@
 """All that a machine with a GPU can tell of this project, in one call of ten minutes, without a network.
 
-    python tests/gpu_session.py --data CAPTURE --out FOLDER [--wheels FOLDER] [--seconds 590]
-    python tests/gpu_session.py --rehearse --out FOLDER [--only environment quick "train mmpi" ...]
+    python benchmarks/gpu_session.py --data CAPTURE --out FOLDER [--wheels FOLDER] [--seconds 590]
+    python benchmarks/gpu_session.py --rehearse --out FOLDER [--only environment quick "train mmpi" ...]
 
 What it found is written to FOLDER/session.json after every part, so that a call that is cut off loses only the part at
 hand. Wheels (of what the machine lacks) are installed into a folder of their own; without pycolmap among them the
@@ -52,7 +52,7 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     """Everything, in the order of what is wanted most."""
     python, bench = [sys.executable], [sys.executable, "-m", "mmpi_ns.scripts.bench"]
     gpu, train = ([sys.executable, str(ROOT / "benchmarks" / name)] for name in ("gpu.py", "train.py"))
-    steps = [sys.executable, str(ROOT / "tests" / "gpu_steps.py")]
+    steps = [sys.executable, str(ROOT / "benchmarks" / "gpu_steps.py")]
     where = ["--output", str(out), "--work", str(work)]
     look = "import platform, torch; print(platform.python_version(), torch.__version__, torch.version.cuda, flush=True)"
     look += "; import triton; print('Triton', triton.__version__, flush=True)"
