@@ -1,11 +1,14 @@
-"""A slow, obvious float64 renderer to compare with. Shares no code with ``mmpi_ns``: plans come in as plain data.
+"""Slow, obvious float64 forms to compare with, and their exact gradients. Share no code with ``mmpi_ns``: plans come in
+as plain data.
 
-Every plane is tested by intersecting it in ordinary 3D coordinates, every lookup is a loop, every ray is composited
-one sample after the other. Blending runs in 60-digit decimals, so that no cancellation needs a clever form.
+One ray at a time, every plane by itself, every lookup and every sample in a loop. Blending runs in 60-digit decimals,
+so that no cancellation needs a clever form.
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 from dataclasses import dataclass, field
 from decimal import Context, Decimal
@@ -21,101 +24,80 @@ _DIGITS = Context(prec=60, Emax=10**9, Emin=-(10**9))
 
 
 @dataclass(frozen=True)
-class Crossing:
-    """Where a ray meets one plane of an MPI."""
+class Crossings:
+    """Where one ray meets the L planes of an MPI, nearest plane first; all [L].
 
-    plane: int
-    """0 is the nearest plane, L - 1 the last one."""
-    live: bool
-    inverse_t: float
-    u: float
-    v: float
-    margin: float
-    """How far the nearest border is, relative to the numbers that were compared. 1e-12: too close to call."""
+    ``size_uv`` and ``size_q`` are sums of the magnitudes that (u, v) and 1/t are made of: an arithmetic of unit
+    roundoff e cannot promise more than a small multiple of e times these.
+    """
 
-
-def to_local(mpi, point, is_direction=False):
-    """A world point (or direction) in the MPI's axes."""
-    x = np.asarray(point, np.float64)
-    if not is_direction:
-        x = x - np.asarray(mpi.origin, np.float64)
-    return np.array([np.dot(np.asarray(row, np.float64), x) for row in mpi.axes])
+    live: np.ndarray
+    inverse_t: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    size_uv: np.ndarray
+    size_q: np.ndarray
+    margin: np.ndarray
+    """Distance to the nearest border that decides about ``live``, relative to such a sum."""
 
 
-def plane_depth(mpi, plane):
-    """Depth of a plane along the facing direction; planes are evenly spaced in 1 / depth."""
-    behind = mpi.planes - 1 - plane
-    if math.isinf(mpi.far):
-        return math.inf if behind == 0 else mpi.near * (mpi.planes - 1) / behind
-    return (mpi.planes - 1) / (behind / mpi.near + plane / mpi.far)
+def in_frame(mpi, origin, direction):
+    """Origin and direction in the MPI's axes, and the sum of the offset's magnitudes."""
+    offset, axes = np.asarray(origin, np.float64) - np.asarray(mpi.origin, np.float64), np.asarray(mpi.axes, np.float64)
+    return axes @ offset, axes @ np.asarray(direction, np.float64), float(np.abs(offset).sum())
 
 
-def cross_plane(mpi, plane, origin, direction, near, far):
-    """Intersects one ray with one plane, or takes its direction for the plane at infinity."""
-    o, d = to_local(mpi, origin), to_local(mpi, direction, is_direction=True)
-    if not d[2] > FACING:
-        return Crossing(plane, False, 0.0, math.nan, math.nan, abs(d[2] - FACING))
-    depth = plane_depth(mpi, plane)
-    if math.isinf(depth):
-        inverse_t, u, v, rounding = 0.0, d[0] / d[2], d[1] / d[2], 1.0
-        checks = [] if math.isinf(far) else [-math.inf]
-    else:
-        t = (depth - o[2]) / d[2]
-        inverse_t = 1 / t if t != 0 else math.inf
-        u, v = (o[0] + t * d[0]) / depth, (o[1] + t * d[1]) / depth
-        rounding = 1 + (abs(o[0]) + abs(o[1]) + abs(t * d[0]) + abs(t * d[1])) / depth
-        size = (abs(depth) + abs(o[2])) / d[2] + near
-        checks = [(t - near) / size, t / size if t != 0 else -1.0]
-        checks += [] if math.isinf(far) else [(far - t) / size]
-    u0, u1, v0, v1 = mpi.extent
-    rounding += max(abs(x) for x in mpi.extent)
-    checks += [(u - u0) / rounding, (u1 - u) / rounding, (v - v0) / rounding, (v1 - v) / rounding]
-    margin = min([abs(c) for c in checks] + [abs(d[2] - FACING)])
-    return Crossing(plane, all(c >= 0 for c in checks), inverse_t, u, v, margin)
+def disparities(mpi):
+    """1 / depth of every plane, evenly spaced from near to far (or to infinity, 0). [L]"""
+    share = np.arange(mpi.planes) / (mpi.planes - 1)
+    return (1 - share) / mpi.near + share / mpi.far
 
 
 def crossings(mpi, origin, direction, near=0.0, far=math.inf):
-    """Every plane of the MPI, nearest first."""
-    return [cross_plane(mpi, plane, origin, direction, near, far) for plane in range(mpi.planes)]
-
-
-def point_to_ndc(mpi, point):
-    """(u, v, s) of a finite world point, each in [-1, 1] over the frustum; None behind the MPI."""
-    x, y, z = to_local(mpi, point)
-    return _ndc(mpi, x, y, z, 1 / z) if z > 0 else None
-
-
-def direction_to_ndc(mpi, direction):
-    """(u, v, s) of a point at infinity; None when it lies behind the MPI."""
-    x, y, z = to_local(mpi, direction, is_direction=True)
-    return _ndc(mpi, x, y, z, 0.0) if z > 0 else None
-
-
-def _ndc(mpi, x, y, z, inverse_depth):
+    """Intersects a ray with every plane of an MPI."""
+    o, d, reach = in_frame(mpi, origin, direction)
+    facing_margin = abs(d[2] - FACING)
+    if not d[2] > FACING:
+        nothing = np.zeros(mpi.planes)
+        return Crossings(nothing > 0, nothing, nothing, nothing, nothing, nothing, nothing + facing_margin)
+    w = disparities(mpi)
+    ahead = 1 - w * o[2]
+    q = w * d[2] / np.where(ahead != 0, ahead, np.nan)
+    u, v = (d[i] / d[2] + w * (o[i] - o[2] * (d[i] / d[2])) for i in (0, 1))
+    steep = (1 + max(abs(d[0]), abs(d[1])) / d[2]) / d[2]
+    size_uv = steep * (1 + w * reach)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size_q = np.abs(q) * (1 + 1 / d[2] + w * reach / np.abs(ahead))
     u0, u1, v0, v1 = mpi.extent
-    share = (1 / mpi.near - inverse_depth) / (1 / mpi.near - 1 / mpi.far)
-    return np.array([2 * (x / z - u0) / (u1 - u0) - 1, 2 * (y / z - v0) / (v1 - v0) - 1, 2 * share - 1])
+    tests = [(gap, size_uv + abs(limit)) for gap, limit in ((u - u0, u0), (u1 - u, u1), (v - v0, v0), (v1 - v, v1))]
+    # t >= near and t <= far, both multiplied out so that nothing is divided by zero.
+    tests.append((ahead - near * w * d[2], 1 + w * (near + reach)))
+    if far < math.inf:
+        tests.append((w * d[2] - ahead / far, w + (1 + w * reach) / far))
+    tests.append((np.where(ahead > 0, ahead, np.minimum(ahead, -1e-300)), 1 + w * reach))
+    live = np.all([gap >= 0 for gap, _ in tests], axis=0)
+    margin = np.min([np.abs(gap) / size for gap, size in tests], axis=0)
+    return Crossings(live, q, u, v, size_uv, size_q, np.minimum(margin, facing_margin))
 
 
-def ray_point_to_ndc(mpi, origin, direction, inverse_t):
-    """(u, v, s) of the point at 1/t along a ray, 0 meaning infinity; None behind the MPI."""
-    if inverse_t == 0:
-        return direction_to_ndc(mpi, direction)
-    return point_to_ndc(mpi, np.asarray(origin, np.float64) + np.asarray(direction, np.float64) / inverse_t)
-
-
-def covers(mpi, origin, direction, inverse_t):
-    """Whether the point at 1/t along a ray lies inside the MPI's frustum."""
-    ndc = ray_point_to_ndc(mpi, origin, direction, inverse_t)
-    return ndc is not None and bool(np.all(np.abs(ndc) <= 1))
+def place_in(mpi, origin, direction, inverse_t):
+    """(u, v, s) of the point at 1/t along a ray (0: infinity), each in [-1, 1] over the frustum, and the size of its
+    numbers; None behind the MPI."""
+    o, d, reach = in_frame(mpi, origin, direction)
+    x, y, z = o * inverse_t + d
+    if z <= 0:
+        return None
+    (u0, u1, v0, v1), depth = mpi.extent, 1 / mpi.near - 1 / mpi.far
+    ndc = np.array([(x / z - u0) / (u1 - u0), (y / z - v0) / (v1 - v0), (1 / mpi.near - inverse_t / z) / depth])
+    steep = (1 + max(abs(x), abs(y)) / z) * (2 / min(u1 - u0, v1 - v0) + inverse_t / depth)
+    return 2 * ndc - 1, float(1 + steep * (reach * inverse_t + 1) / z)
 
 
 def ndc_to_world(mpi, ndc):
     """World point of an NDC position, or (direction, True) for one on the plane at infinity."""
     u0, u1, v0, v1 = mpi.extent
     u, v = u0 + (ndc[0] + 1) / 2 * (u1 - u0), v0 + (ndc[1] + 1) / 2 * (v1 - v0)
-    x, y, z = (np.asarray(row, np.float64) for row in mpi.axes)
-    direction = u * x + v * y + z
+    direction = np.array([u, v, 1.0]) @ np.asarray(mpi.axes, np.float64)
     share = (ndc[2] + 1) / 2
     inverse_depth = (1 - share) / mpi.near + share / mpi.far
     if inverse_depth == 0:
@@ -124,89 +106,119 @@ def ndc_to_world(mpi, ndc):
 
 
 def cube_samples(cube, step, origin, direction, near=0.0, far=math.inf):
-    """[(index, margin)] of the sample positions (i + 1/2) step that lie inside the cube, tested one by one."""
-    o, d = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
-    lower, upper = np.asarray(cube.lower, np.float64), np.asarray(cube.upper, np.float64)
-    reach = np.linalg.norm(o - (lower + upper) / 2) + np.linalg.norm(upper - lower)
-    found, margin = [], math.inf
-    for i in range(int(reach / step) + 2):
-        t = (i + 0.5) * step
-        point = o + t * d
-        gaps = np.concatenate([point - lower, upper - point])[np.concatenate([d, d]) != 0]
-        margin = min(margin, float(np.min(np.abs(gaps))) / reach, abs(t - near) / reach, abs(far - t) / reach)
-        if np.all(point >= lower) and np.all(point <= upper) and near <= t <= far:
-            found.append(i)
-    return found, margin
+    """Indices i of the positions (i + 1/2) step inside the cube, tested one by one, and the closest decision."""
+    lower, upper, direction = np.asarray(cube.lower), np.asarray(cube.upper), np.asarray(direction, np.float64)
+    reach = float(np.linalg.norm(origin - (lower + upper) / 2) + np.linalg.norm(upper - lower))
+    t = (np.arange(int(reach / step) + 2) + 0.5) * step
+    points = origin + t[:, None] * direction
+    inside = ((points >= lower) & (points <= upper)).all(-1) & (t >= near) & (t <= far)
+    gaps = np.abs(np.concatenate([points - lower, points - upper], -1)[:, np.tile(direction != 0, 2)])
+    margin = min(float(gaps.min()), float(np.abs(t - near).min()), float(np.abs(t - far).min())) / reach
+    return np.flatnonzero(inside).tolist(), margin
 
 
-# Lookups -------------------------------------------------------------------------------------------------------------
+# Lookups and densities -----------------------------------------------------------------------------------------------
 
 
-def _cell(coordinate, size):
-    position = min(max((coordinate + 1) / 2 * (size - 1), 0.0), size - 1.0)
-    lower = min(math.floor(position), size - 2)
-    return lower, position - lower
+def corners(place, shape):
+    """(index, weight) of the texels around (u, v) or (u, v, s) in [-1, 1]; corners of the range are texel centres."""
+    axes = []
+    for x, n in zip(reversed([*place]), shape, strict=True):
+        at = min(max((float(x) + 1) / 2 * (n - 1), 0.0), n - 1.0)
+        lower = min(math.floor(at), n - 2)
+        axes.append(((lower, 1 - (at - lower)), (lower + 1, at - lower)))
+    return [(tuple(i for i, _ in c), math.prod(weight for _, weight in c)) for c in itertools.product(*axes)]
 
 
-def bilinear(image, u, v):
-    """Value of an image [H, W, C] at (u, v) in [-1, 1]; corners are texel centres."""
-    (x, fx), (y, fy) = _cell(u, image.shape[1]), _cell(v, image.shape[0])
-    value = np.zeros(image.shape[2])
-    for dy, wy in ((0, 1 - fy), (1, fy)):
-        for dx, wx in ((0, 1 - fx), (1, fx)):
-            value = value + wy * wx * image[y + dy, x + dx]
-    return value
+def lookup(table, place):
+    """Value of an image [H, W, C] at (u, v), or of a volume [D, H, W, C] at (u, v, s)."""
+    return sum(weight * table[index] for index, weight in corners(place, table.shape[:-1]))
 
 
-def trilinear(volume, ndc):
-    """Value of a volume [D, H, W, C] at (u, v, s) in [-1, 1]^3."""
-    z, fz = _cell(ndc[2], volume.shape[0])
-    return (1 - fz) * bilinear(volume[z], ndc[0], ndc[1]) + fz * bilinear(volume[z + 1], ndc[0], ndc[1])
+@functools.cache
+def plane_bias(planes):
+    """Biases with which all planes start at equal weight, and the interval 256 / L. Solved in decimals."""
+    interval = Decimal(256) / planes
+    biases = []
+    for plane in range(planes):
+        alpha = min(1 / Decimal(planes - plane), Decimal("0.999"))
+        depth = -_DIGITS.ln(1 - alpha) / interval
+        biases.append(float(_DIGITS.ln(_DIGITS.exp(depth) - 1)))
+    return np.array(biases), float(interval)
 
 
 # Blending and compositing --------------------------------------------------------------------------------------------
 
 
-def _share(reliability, cover, own):
-    """P of a head among those that cover the point, and what the others have together: exact to 60 digits."""
-    exps = {j: _DIGITS.exp(Decimal(float(r))) for j, (r, c) in enumerate(zip(reliability, cover, strict=True)) if c}
-    total = rest = Decimal(0)
-    for j, e in exps.items():
-        total = _DIGITS.add(total, e)
-        rest = _DIGITS.add(rest, e) if j != own else rest
-    return _DIGITS.divide(exps[own], total), _DIGITS.divide(rest, total)
+def shares(reliability, cover, own):
+    """Every head's share P (0 where it does not cover), and what the others than ``own`` have together."""
+    weights = [_DIGITS.exp(Decimal(float(r))) if c else Decimal(0) for r, c in zip(reliability, cover, strict=True)]
+    total, rest = (functools.reduce(_DIGITS.add, w, Decimal(0)) for w in (weights, weights[:own] + weights[own + 1 :]))
+    return [_DIGITS.divide(w, total) for w in weights], _DIGITS.divide(rest, total)
 
 
 def log_shares(reliability, cover, own):
     """log P and log(1 - P); -inf for a sole cover."""
-    share, rest = _share(reliability, cover, own)
-    return float(_DIGITS.ln(share)), -math.inf if rest == 0 else float(_DIGITS.ln(rest))
+    every, rest = shares(reliability, cover, own)
+    return float(_DIGITS.ln(every[own])), -math.inf if rest == 0 else float(_DIGITS.ln(rest))
 
 
-def blended_depth(tau, reliability, cover, own):
+@dataclass(frozen=True)
+class Blended:
+    """A sample's optical depth after blending, and its derivatives."""
+
+    depth: float
+    by_tau: float
+    by_reliability: np.ndarray
+    """[H]"""
+
+
+def blend(tau, reliability, cover, own):
     """-log(1 - alpha') with alpha' = P alpha."""
-    share, rest = _share(reliability, cover, own)
-    passes = _DIGITS.add(rest, _DIGITS.multiply(share, _DIGITS.exp(Decimal(-float(tau)))))
-    return float(_DIGITS.minus(_DIGITS.ln(passes)))
+    every, rest = shares(reliability, cover, own)
+    share = every[own]
+    # d share / d R_j = share (1 if j is own - P_j)
+    slopes = [_DIGITS.multiply(share, (rest if j == own else -p)) for j, p in enumerate(every)]
+    clear = _DIGITS.exp(-Decimal(float(tau)))
+    passes = _DIGITS.add(rest, _DIGITS.multiply(share, clear))
+    opaque = _DIGITS.divide(_DIGITS.subtract(1, clear), passes)
+    by_tau = float(_DIGITS.divide(_DIGITS.multiply(share, clear), passes))
+    return Blended(float(-_DIGITS.ln(passes)), by_tau, np.array([float(_DIGITS.multiply(s, opaque)) for s in slopes]))
 
 
 @dataclass(frozen=True)
 class Composited:
-    """What one ray gathers, sample by sample."""
+    """What one ray gathers, sample by sample, nearest first."""
 
     weights: np.ndarray
+    in_front: np.ndarray
+    """Transmittance in front of each sample."""
     transmittance: float
     accumulation: float
 
 
 def composite(taus):
     """Front to back, one sample after the other. taus are optical depths, nearest first."""
-    transmittance, weights = 1.0, []
-    for tau in taus:
-        alpha = -math.expm1(-tau)
-        weights.append(transmittance * alpha)
-        transmittance *= math.exp(-tau)
-    return Composited(np.array(weights), transmittance, 1 - transmittance)
+    depth, weights, in_front = 0.0, [], []
+    for tau in np.asarray(taus, np.float64).tolist():
+        in_front.append(math.exp(-depth))
+        weights.append(in_front[-1] * -math.expm1(-tau))
+        depth += tau
+    return Composited(np.array(weights), np.array(in_front), math.exp(-depth), -math.expm1(-depth))
+
+
+def composite_gradient(taus, by_weight, by_transmittance):
+    """d/d tau_i of sum_k by_weight_k w_k + by_transmittance T, back to front.
+
+    A deeper sample i lets T_i e^{-tau_i} less through: its own weight gains that, all weights behind lose themselves.
+    """
+    made = composite(taus)
+    behind = by_transmittance * made.transmittance
+    gradient = np.zeros(len(made.weights))
+    for i in range(len(gradient) - 1, -1, -1):
+        gradient[i] = by_weight[i] * made.in_front[i] * math.exp(-float(taus[i])) - behind
+        behind += by_weight[i] * made.weights[i]
+    return gradient
 
 
 def median_inverse_distance(weights, inverse_t):
@@ -241,7 +253,6 @@ class RenderedRay:
     """A whole ray, with its samples in the order in which they were met."""
 
     samples: list[RaySample]
-    taus: np.ndarray
     weights: np.ndarray
     color: np.ndarray
     accumulation: float
@@ -255,12 +266,10 @@ def render_ray(samples_by_head, blends=True):
     Equal distances are met in the order (head, plane).
     """
     samples = sorted((s for head in samples_by_head for s in head), key=lambda s: (-s.inverse_t, s.head, s.plane))
-    taus = [blended_depth(s.tau, s.reliability, s.cover, s.head) if blends else s.tau for s in samples]
+    taus = [blend(s.tau, s.reliability, s.cover, s.head).depth if blends else s.tau for s in samples]
     gathered = composite(taus)
     color = np.zeros(3)
     for weight, sample in zip(gathered.weights, samples, strict=True):
         color = color + weight * np.asarray(sample.color, np.float64)
     median = median_inverse_distance(list(gathered.weights), [s.inverse_t for s in samples])
-    return RenderedRay(
-        samples, np.array(taus), gathered.weights, color, gathered.accumulation, gathered.transmittance, median
-    )
+    return RenderedRay(samples, gathered.weights, color, gathered.accumulation, gathered.transmittance, median)

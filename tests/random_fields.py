@@ -95,9 +95,8 @@ def render(field, rays, threshold=0.0, blends=False, **chosen):
 def _density_constants(field, k):
     """(factor on softplus, bias of every plane) from the definition: equal weights, or the cube's initial alpha."""
     if k < len(field.plan.mpis):
-        planes = field.plan.mpis[k].planes
-        alphas, interval = np.minimum(1 / np.arange(planes, 0, -1), 0.999), 256 / planes
-        return interval * field.layout.depth_scale, np.log((1 - alphas) ** (-1 / interval) - 1)
+        biases, interval = oracle.plane_bias(field.plan.mpis[k].planes)
+        return interval * field.layout.depth_scale, biases
     interval = 1 / field.samples_per_voxel
     return interval, np.full(field.grids[k].depth, math.log((1 - field.cube_alpha) ** (-1 / interval) - 1))
 
@@ -126,7 +125,8 @@ def _color(networks, k, features, ndc, direction):
 
 def _places(plan, origin, direction, inverse_t):
     """NDC of a point in every head, None where it is behind an MPI or, in the cube, at infinity."""
-    found = [oracle.ray_point_to_ndc(m, origin, direction, inverse_t) for m in plan.mpis]
+    found = [oracle.place_in(m, origin, direction, inverse_t) for m in plan.mpis]
+    found = [None if place is None else place[0] for place in found]
     if plan.cube is not None:
         lower, upper = np.array(plan.cube.lower), np.array(plan.cube.upper)
         point = None if inverse_t == 0 else origin + direction / inverse_t
@@ -142,8 +142,8 @@ class OracleRay:
         self.margin, self.heads, plan = math.inf, [], field.plan
         for k, mpi in enumerate(plan.mpis):
             found = oracle.crossings(mpi, origin, direction, near, far)
-            self.margin = min([self.margin, *(c.margin for c in found)])
-            self.heads.append([self._sample(k, c.plane, c.inverse_t) for c in found if c.live])
+            self.margin = min(self.margin, float(found.margin.min()))
+            self.heads.append([self._sample(k, p, found.inverse_t[p]) for p in np.flatnonzero(found.live).tolist()])
         if plan.cube is not None:
             sides = [(b - a) / (n - 1) for a, b, n in zip(plan.cube.lower, plan.cube.upper, plan.cube.shape[::-1])]  # noqa: B905
             step = min(sides) / field.samples_per_voxel
@@ -159,10 +159,10 @@ class OracleRay:
         places = _places(field.plan, self.origin, self.direction, inverse_t)
         ndc, (scale, biases) = places[k], _density_constants(field, k)
         if k < len(field.plan.mpis):
-            tables = [oracle.bilinear(_table(field, t, k)[plane], *ndc[:2]) for t in (field.density, field.features)]
+            tables = [oracle.lookup(_table(field, t, k)[plane], ndc[:2]) for t in (field.density, field.features)]
             axes, bias = np.array(field.plan.mpis[k].axes), biases[plane]
         else:
-            tables = [oracle.trilinear(_table(field, t, k), ndc) for t in (field.density, field.features)]
+            tables = [oracle.lookup(_table(field, t, k), ndc) for t in (field.density, field.features)]
             axes, bias = np.eye(3), biases[0]
         votes = [self._vote(j, place, j == k, ndc) for j, place in enumerate(places)]
         copies = len(field.plan.mpis) - len(field.full_plan.mpis)
@@ -190,7 +190,7 @@ class OracleRay:
             at = min(max((coordinate + 1) / 2 * (size - 1), 0), size - 1)
             self.margin = min(self.margin, abs(at % 1 - 0.5) if not touched.all() else math.inf)
             position.append(round(at))
-        value = oracle.trilinear(_table(self.field, self.field.reliability, j), np.clip(ndc, -1, 1))[0]
+        value = oracle.lookup(_table(self.field, self.field.reliability, j), np.clip(ndc, -1, 1))[0]
         return value, own or bool(touched[tuple(position)])
 
     def render(self, blends=False, heads=None):

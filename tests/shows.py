@@ -46,7 +46,7 @@ def as_float64_says(field, count, blends=True):
             ndc = _places(field.plan, origins[i], directions[i], sample.inverse_t)[sample.head]
             table = _table(field, field.features, sample.head)
             in_cube = sample.head == len(field.plan.mpis)
-            raw = oracle.trilinear(table, ndc) if in_cube else oracle.bilinear(table[sample.plane], *ndc[:2])
+            raw = oracle.lookup(table, ndc) if in_cube else oracle.lookup(table[sample.plane], ndc[:2])
             gathered += weight * np.concatenate([1 / (1 + np.exp(-raw[:3])), np.tanh(raw[3:])])
             masses[sample.head] += weight
         assert np.abs(found.gathered[i].double().numpy() - gathered).max() < 5e-5

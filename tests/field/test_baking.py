@@ -36,7 +36,7 @@ def oracle_share(field, k, z, y, x):
             margin = min([margin, *(abs(a % 1 - 0.5) for a in at)])
             nearest = tuple(min(max(round(a), 0), n - 1) for a, n in zip(at, touched.shape, strict=True))
             cover[j] = bool((np.abs(place) <= 1).all()) and bool(touched[nearest])
-        votes[j] = oracle.trilinear(_table(field, field.reliability, j), np.clip(place, -1, 1))[0]
+        votes[j] = oracle.lookup(_table(field, field.reliability, j), np.clip(place, -1, 1))[0]
     return math.exp(oracle.log_shares(votes, cover, k)[0]), margin
 
 

@@ -128,7 +128,7 @@ def test_blended_depth_equals_the_oracle(scale, dtype):
     reliability = tensor(reliability, dtype).double().numpy()
     tau = tensor(np.concatenate([[0.0, 1e4, 1e-12], 10 ** rng.uniform(-8, 4, size=297)]), dtype)
     votes = (reliability, cover, own)
-    wanted = [oracle.blended_depth(*args) for args in zip(tau.tolist(), *votes, strict=True)]
+    wanted = [oracle.blend(*args).depth for args in zip(tau.tolist(), *votes, strict=True)]
     found = blended_optical_depth(tau, *shares_of(votes, dtype)).double().numpy()
     ulp = torch.finfo(dtype).eps * max(4.0, np.abs(reliability).max())
     assert np.all(np.abs(found - wanted) <= 2 * ulp * (1 + np.array(wanted)))
@@ -156,7 +156,7 @@ def test_thin_samples_keep_their_relative_precision_in_float32(depth, level):
     votes = random_votes(np.random.default_rng(2), 200, 3, 1.0)
     votes = (tensor(votes[0] + level, torch.float32).double().numpy(), *votes[1:])
     tau = torch.full((200,), depth)
-    wanted = [oracle.blended_depth(*args) for args in zip(tau.tolist(), *votes, strict=True)]
+    wanted = [oracle.blend(*args).depth for args in zip(tau.tolist(), *votes, strict=True)]
     found = blended_optical_depth(tau, *shares_of(votes, torch.float32))
     assert np.allclose(found, wanted, rtol=3e-6, atol=0)
 
@@ -200,7 +200,7 @@ def test_small_gradients_of_reliability_are_right_in_float32(gap):
         shares = blend_shares(reliability, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]))
         blended_optical_depth(torch.tensor([tau]), *shares).sum().backward()
         h, either = 1e-3, np.ones(2, bool)
-        above, below = (oracle.blended_depth(tau, [gap + s, 0.0], either, 0) for s in (h, -h))
+        above, below = (oracle.blend(tau, [gap + s, 0.0], either, 0).depth for s in (h, -h))
         assert reliability.grad[0].tolist() == pytest.approx(
             [(above - below) / 2 / h, -(above - below) / 2 / h], rel=1e-4
         )

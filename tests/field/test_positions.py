@@ -93,28 +93,28 @@ def exact(field, point, learns_reliability):
             for table in (field.density, field.features, field.reliability, field.touched)
         )
         if k < size:
-            mpi, ndc = plan.mpis[k], oracle.point_to_ndc(plan.mpis[k], point)
-            ndc = np.full(3, 2.0) if ndc is None else ndc
+            mpi, place = plan.mpis[k], oracle.place_in(plan.mpis[k], point, np.zeros(3), 1.0)
+            ndc = np.full(3, 2.0) if place is None else place[0]
             at = (ndc[2] + 1) / 2 * (mpi.planes - 1)
             near = int(np.clip(np.floor(at), 0, mpi.planes - 2))
             planes = (
-                np.log1p(np.exp(oracle.bilinear(raw[p], *ndc[:2])[0] + float(field.layout.biases[k][p])))
+                np.log1p(np.exp(oracle.lookup(raw[p], ndc[:2])[0] + float(field.layout.biases[k][p])))
                 for p in (near, near + 1)
             )
             tau_near, tau_far = (256.0 / mpi.planes * x for x in planes)
-            depth = oracle.to_local(mpi, point)[2]
+            depth = oracle.in_frame(mpi, point, point)[0][2]
             step = depth**2 * (1 / mpi.near - 1 / mpi.far) / (mpi.planes - 1)
             density = (tau_near + (at - near) * (tau_far - tau_near)) / step
         else:
             cube = plan.cube
             ndc = 2 * (point - np.array(cube.lower)) / np.subtract(cube.upper, cube.lower) - 1
             side = min(np.subtract(cube.upper, cube.lower) / (np.array(cube.shape[::-1]) - 1))
-            density = np.log1p(np.exp(oracle.trilinear(raw, ndc)[0] + field.layout.cube_bias)) / side
+            density = np.log1p(np.exp(oracle.lookup(raw, ndc)[0] + field.layout.cube_bias)) / side
         nearest = [int(np.clip(round((ndc[i] + 1) / 2 * (block[2 - i] - 1)), 0, block[2 - i] - 1)) for i in (2, 1, 0)]
         inside = bool(np.abs(ndc).max() <= 1)
         taus.append(density)
-        values.append(oracle.trilinear(features, np.clip(ndc, -1, 1)))
-        reliability.append(oracle.trilinear(votes, np.clip(ndc, -1, 1))[0])
+        values.append(oracle.lookup(features, np.clip(ndc, -1, 1)))
+        reliability.append(oracle.lookup(votes, np.clip(ndc, -1, 1))[0])
         covers.append(inside and (not learns_reliability or bool(touched[tuple(nearest)][0])))
     shares = [
         0.0 if not covers[k] else math.exp(oracle.log_shares(reliability, covers, k)[0]) if learns_reliability else 1.0

@@ -7,8 +7,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import oracle
 import torch
-from stability import exact
+from random_scenes import Array
+from scipy.special import expit
 from stability.cases import (
     Case,
     Outcome,
@@ -20,7 +22,6 @@ from stability.cases import (
     single,
     tried,
 )
-from stability.exact import Array
 
 from mmpi_ns.blending import blend_shares, blended_optical_depth
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -47,9 +48,9 @@ def _density(raw: Array, planes: int, precision: Precision) -> Outcome:
     values, index = np.tile(single(raw), planes), np.repeat(np.arange(planes), len(raw))
     layout, at = _layout(planes), torch.tensor(index)
     (tau,), (gradient,) = tried(precision, lambda x: layout.optical_depth(0, x, at), values)
-    bias, interval = exact.plane_bias(planes)
+    bias, interval = oracle.plane_bias(planes)
     x = values + bias[index]
-    wanted, slope = exact.softplus(x) * interval, exact.sigmoid(x) * interval
+    wanted, slope = np.logaddexp(0, x) * interval, expit(x) * interval
     size = np.abs(values) + np.abs(bias[index]) + 1
     # d sigmoid = sigmoid (1 - sigmoid) dx <= sigmoid dx.
     return Outcome(compare(tau, wanted, wanted + slope * size, 16), compare(gradient, slope, slope * size, 16))
@@ -64,7 +65,7 @@ def _equal_start(planes: int, precision: Precision) -> Outcome:
     wanted = np.full(planes, 1 / planes)
     wanted[-1] *= 0.999
     # log(e^b - 1) is rounded once, at magnitudes up to |b|; the depths in front add up to log L.
-    size = wanted * (1 + np.abs(exact.plane_bias(planes)[0]).max() + math.log(planes))
+    size = wanted * (1 + np.abs(oracle.plane_bias(planes)[0]).max() + math.log(planes))
     return Outcome(compare(made.weights[0], wanted, size, 16))
 
 
@@ -83,11 +84,11 @@ def _blending(heads: int, scale: float, precision: Precision, level: float = 0.0
         return blended_optical_depth(depth, *blend_shares(votes, torch.tensor(cover), torch.tensor(own)))
 
     (found,), (found_by_vote, found_by_tau) = tried(precision, blended, given, tau)
-    wanted = [exact.blend(t, r, c, int(o), True) for t, r, c, o in zip(tau, reliability, cover, own, strict=True)]
+    wanted = [oracle.blend(t, r, c, int(o)) for t, r, c, o in zip(tau, reliability, cover, own, strict=True)]
     value, by_tau, by_vote = (np.array([getattr(w, n) for w in wanted]) for n in ("depth", "by_tau", "by_reliability"))
     highest = np.where(cover, reliability, -np.inf).max(-1)
     spread = 1 + highest - np.where(cover, reliability, np.inf).min(-1)
-    share = np.array([float(exact.shares(r, c, int(o))[0][o]) for r, c, o in zip(reliability, cover, own, strict=True)])
+    share = np.exp([oracle.log_shares(*row)[0] for row in zip(reliability, cover, own, strict=True)])
     # A log share is a difference of reliabilities, so it is known to a rounding of their spread; it scales tau' of a
     # thin sample, and moves -log(1 - alpha') of an opaque one by at most as much.
     size = value + np.minimum(value, 1) * spread + by_tau * tau
@@ -144,7 +145,7 @@ def _composite(taus: Array, precision: Precision, dropped: bool = False) -> Outc
     (weights, transmittance, accumulation), (gradient,) = tried(precision, composited, taus, by=(by_weight, by_rest))
     errors, gradients = [], []
     for r, tau in enumerate(taus):
-        wanted = exact.composite(tau)
+        wanted = oracle.composite(tau)
         front = 1 - np.log(np.maximum(wanted.in_front, 1e-300))
         rest = wanted.transmittance
         errors += [
@@ -153,7 +154,7 @@ def _composite(taus: Array, precision: Precision, dropped: bool = False) -> Outc
             compare(accumulation[r], [wanted.accumulation], wanted.accumulation, roundings),
         ]
         g = np.where(kept[r], by_weight[r], 0)
-        slope = np.where(kept[r], exact.composite_gradient(tau, g, float(by_rest[r, 0])), 0)
+        slope = np.where(kept[r], oracle.composite_gradient(tau, g, float(by_rest[r, 0])), 0)
         behind = np.abs(g * wanted.weights) * front
         size = np.abs(g) * wanted.in_front * front + np.cumsum(behind[::-1])[::-1] - behind
         size = size + np.abs(by_rest[r]) * rest * (1 + tau.sum())
@@ -170,8 +171,8 @@ def _empty_slots(precision: Precision) -> Outcome:
         [[0.3, math.nan, 0.5, math.inf, 1e30]],
     )
     taus, wanted, slope = single([0.3, 0.5]), np.zeros((1, 5)), np.zeros((1, 5))
-    wanted[0, [0, 2]] = exact.composite(taus).weights
-    slope[0, [0, 2]] = exact.composite_gradient(taus, np.ones(2), 0.0)
+    wanted[0, [0, 2]] = oracle.composite(taus).weights
+    slope[0, [0, 2]] = oracle.composite_gradient(taus, np.ones(2), 0.0)
     return Outcome(compare(weights, wanted, 1.0, 4), compare(gradient, slope, 1.0, 8))
 
 

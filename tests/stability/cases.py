@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from stability.exact import Array
+from random_scenes import Array
 from torch import Tensor
 
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan

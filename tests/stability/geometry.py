@@ -9,10 +9,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import oracle
 from hand_made import samples_to_ndc
 from plane_crossings import AHEAD, crossings
-from random_scenes import bundle_of
-from stability import exact
+from random_scenes import Array, bundle_of
 from stability.cases import (
     UNIT,
     Case,
@@ -27,7 +27,6 @@ from stability.cases import (
     single,
     snap,
 )
-from stability.exact import Array
 
 from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
@@ -50,7 +49,7 @@ def measure_hits(rays: Callable[[], Rays], precision: Precision) -> Outcome:
     for k, mpi in enumerate(mpis):
         live, u, v, inverse_t = (as_array(x) for x in crossings(hits, frames, k, mpi.planes))
         for i in range(len(origins)):
-            wanted = exact.cross(mpi, origins[i], directions[i], near, far)
+            wanted = oracle.crossings(mpi, origins[i], directions[i], near, far)
             wrong += int((wanted.live != live[i])[wanted.margin > ROUNDINGS * UNIT].sum())
             both = wanted.live & (live[i] > 0)
             for found, expected, size in (
@@ -72,7 +71,7 @@ def measure_places(rays: Callable[[], Rays], precision: Precision) -> Outcome:
         ndc, inside = samples_to_ndc(float32(origins), float32(directions), float32(inverse_t), Frames.pack(mpis))
     errors, wrong = [Error(0.0, ROUNDINGS * UNIT)], 0
     for i, k in np.ndindex(len(origins), len(mpis)):
-        wanted = exact.place_in(mpis[k], origins[i], directions[i], float(inverse_t[i]))
+        wanted = oracle.place_in(mpis[k], origins[i], directions[i], float(inverse_t[i]))
         if wanted is None:
             wrong += bool(inside[i, k])
             continue
@@ -102,7 +101,7 @@ def measure_cube(scale: float, parallel: bool, precision: Precision) -> Outcome:
         first, number = cube_hits(rays.origins, rays.directions, rays.nears, rays.fars, cube)  # type: ignore[arg-type]
     wrong = 0
     for i in range(count):
-        wanted, margin = exact.cube_steps(plan, cube.step, origins[i], directions[i], near, math.inf)
+        wanted, margin = oracle.cube_samples(plan, cube.step, origins[i], directions[i], near, math.inf)
         wrong += margin > 64 * UNIT and wanted != list(range(int(first[i]), int(first[i] + number[i])))
     return Outcome.of([], wrong=wrong)
 

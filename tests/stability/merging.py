@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+import oracle
 import torch
-from stability import exact
+from random_scenes import Array
 from stability.cases import UNIT, Case, Outcome, Precision, compare, float32, single, tried
-from stability.exact import Array
 
 from mmpi_ns.ops.depth_sums import depth_sums
 from mmpi_ns.ops.interpolate import interpolate
@@ -22,17 +21,6 @@ from mmpi_ns.training import losses
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Lookups -------------------------------------------------------------------------------------------------------------
-
-
-def _corners_of(position: Array, shape: tuple[int, ...]) -> list[tuple[tuple[int, ...], float]]:
-    """(index, weight) of the texels around a position in [-1, 1]^D; corners of the range are texel centres."""
-    axes = []
-    for x, n in zip(position, shape, strict=True):
-        at = min(max((float(x) + 1) / 2 * (n - 1), 0.0), n - 1.0)
-        lower = min(math.floor(at), n - 2)
-        axes.append(((lower, 1 - (at - lower)), (lower + 1, at - lower)))
-    corners = itertools.product(*axes)
-    return [(tuple(i for i, _ in corner), math.prod(weight for _, weight in corner)) for corner in corners]
 
 
 def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
@@ -49,7 +37,7 @@ def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
     wanted, slope, sizes = np.zeros((len(uv), 2)), np.zeros_like(images), np.zeros_like(images)
     reads = np.zeros(images.shape[:3])
     for i, (u, v) in enumerate(uv):
-        for texel, weight in _corners_of((v, u), (side, 3)):
+        for texel, weight in oracle.corners((u, v), (side, 3)):
             at = (planes[i], *texel)
             wanted[i] += weight * images[at]
             slope[at] += weight * by[i]
@@ -102,7 +90,7 @@ def _dropping(taus: Array, threshold: float, share: float, precision: Precision,
         )
     errors, wrong, roundings = [], 0, 4 + math.log2(samples)
     for r in range(rays):
-        made, bound, there = exact.composite(taus[r]), min(threshold, share / samples), valid[r]
+        made, bound, there = oracle.composite(taus[r]), min(threshold, share / samples), valid[r]
         kept = np.zeros(samples, bool)
         kept[(order[r][there] - r * samples).tolist()] = True
         size = made.weights * (1 - np.log(np.maximum(made.in_front, 1e-300)))

@@ -38,30 +38,21 @@ def slow_votes(plan, origins, directions, depths, colors):
     out, unsure = {}, set()
     for origin, direction, (inverse, error), color in zip(origins, directions, depths, colors, strict=True):
         for k, mpi in enumerate(plan.mpis):
-            for c in oracle.crossings(mpi, origin, direction, plan.ray_near):
-                u0, u1, v0, v1 = mpi.extent
-                x, y = (c.u - u0) / (u1 - u0) * (mpi.width - 1), (c.v - v0) / (v1 - v0) * (mpi.height - 1)
-                if (not c.live and c.margin > TOO_CLOSE) or math.isnan(x):
-                    continue
-                # The next plane's inverse distance, from the slope of 1/t over the disparity w of planes.
-                w = 1 / oracle.plane_depth(mpi, c.plane)
-                o, d = oracle.to_local(mpi, origin), oracle.to_local(mpi, direction, is_direction=True)
-                step = (1 / mpi.near - 1 / mpi.far) / (mpi.planes - 1)
-                h = 1e-6 * step
-                slope = ((w + h) * d[2] / (1 - (w + h) * o[2]) - (w - h) * d[2] / (1 - (w - h) * o[2])) / (2 * h)
-                spacing = step * abs(slope)
+            found, (u0, u1, v0, v1) = oracle.crossings(mpi, origin, direction, plan.ray_near), mpi.extent
+            o, d, _ = oracle.in_frame(mpi, origin, direction)
+            w = oracle.disparities(mpi)
+            # The next plane's inverse distance, from the slope of 1/t = w d / (1 - w o) over the disparity w of planes.
+            spacings = (w[0] - w[1]) * np.abs(d[2]) / (1 - w * o[2]) ** 2
+            for plane in np.flatnonzero(found.live | (found.margin <= TOO_CLOSE)).tolist():
+                x, y = (found.u[plane] - u0) / (u1 - u0), (found.v[plane] - v0) / (v1 - v0)
+                x, y, spacing = x * (mpi.width - 1), y * (mpi.height - 1), spacings[plane]
                 width = max(error, PLANE_ERROR * spacing)
-                before = (c.inverse_t - inverse) / width
-                texel = (
-                    k,
-                    c.plane,
-                    round(float(np.clip(y, 0, mpi.height - 1))),
-                    round(float(np.clip(x, 0, mpi.width - 1))),
-                )
-                near = min(abs(abs(before) - 1), abs(before - EMPTY_FROM), abs(x % 1 - 0.5), abs(y % 1 - 0.5), c.margin)
-                if near < TOO_CLOSE or abs(1 - w * o[2]) < 2e-3:
-                    unsure.update((k, c.plane, b, a) for b in _near(y, mpi.height) for a in _near(x, mpi.width))
+                before, margin = (found.inverse_t[plane] - inverse) / width, found.margin[plane]
+                near = min(abs(abs(before) - 1), abs(before - EMPTY_FROM), abs(x % 1 - 0.5), abs(y % 1 - 0.5), margin)
+                if near < TOO_CLOSE or abs(1 - w[plane] * o[2]) < 2e-3:
+                    unsure.update((k, plane, b, a) for b in _near(y, mpi.height) for a in _near(x, mpi.width))
                     continue
+                texel = (k, plane, round(np.clip(y, 0, mpi.height - 1)), round(np.clip(x, 0, mpi.width - 1)))
                 entry = out.setdefault(texel, np.zeros(5))
                 if abs(before) <= 1:
                     share = min(1.0, spacing / width)
@@ -121,8 +112,7 @@ def test_planes_before_a_surface_are_empty_the_surface_is_dense_and_what_lies_be
     before, rows = alphas(field)
     start_from_votes(field, votes_of(field, *rays, [[0.9, 0.5, 0.1]] * 500))
     after, _ = alphas(field)
-    depths = np.array([oracle.plane_depth(field.plan.mpis[0], p) for p in range(9)])
-    surface = int(np.abs(1 / depths - 0.5).argmin())
+    surface = int(np.abs(oracle.disparities(field.plan.mpis[0]) - 0.5).argmin())
     assert (after[: surface - 1] < 0.2 * before[: surface - 1]).all()
     assert after[surface - 1] == before[surface - 1], "within two errors of the surface: no vote"
     assert after[surface].item() == pytest.approx((500 + PRIOR * before[surface].item()) / (500 + PRIOR), rel=1e-3)
