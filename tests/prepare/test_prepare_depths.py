@@ -22,17 +22,14 @@ from mmpi_prepare.settings import Settings
 COUNT, POSES = 8, corridor.poses(8)
 
 
-def write_depths(folder, poses, form="png", unit=1.0):
-    """Depth images with 1 % of noise and a hole, for frame_001.png and so on; ``unit`` is that of the file."""
+def write_depths(folder, poses):
+    """Depth images with 1 % of noise and a hole, for frame_001.png and so on."""
     folder.mkdir()
     random = np.random.default_rng(0)
     for i, pose in enumerate(poses, 1):
         metres = corridor.depth(pose) * random.normal(1, 0.01, (corridor.HEIGHT, corridor.WIDTH))
         metres[:40, :40] = 0
-        if form == "npy":
-            np.save(folder / f"frame_{i:03d}.npy", (metres / unit).astype(np.float32))
-        else:
-            Image.fromarray((1000 * metres / unit).round().astype(np.uint16)).save(folder / f"frame_{i:03d}.png")
+        Image.fromarray((1000 * metres).round().astype(np.uint16)).save(folder / f"frame_{i:03d}.png")
     return folder
 
 

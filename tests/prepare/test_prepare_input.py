@@ -151,11 +151,9 @@ def test_focal_length_comes_from_the_option_then_exif_then_a_guess():
         assert camera.mean_focal_length() == expected
 
 
-def chain(count, loop=None):
-    """Similarity that falls off along a sequence; the first and last ``loop`` frames see the same."""
+def chain(count):
+    """Similarity that falls off along a sequence."""
     place = np.arange(count, dtype=float)
-    if loop:
-        place[-loop:] = place[:loop]
     alike = np.exp(-((place[:, None] - place[None]) ** 2) / 50)
     np.fill_diagonal(alike, -1)
     return alike.astype(np.float32)
@@ -173,15 +171,6 @@ def test_matching_is_chosen_by_count_and_order():
         (numbered, mixed, True, "sequential (frames of a video), "),
     ):
         assert features.choose_pairs("auto", names, alike, 10, from_video)[1].startswith(way)
-
-
-def test_revisits_close_the_loop_and_a_straight_drive_has_none():
-    names = [str(i) for i in range(150)]
-    found, _ = features.choose_pairs("sequential", names, chain(150, loop=10), 10, False)
-    again = [(i, j) for i, j in found if j - i > 45]
-    assert (0, 140) in again and all(i < 20 and j >= 130 for i, j in again)
-    straight, says = features.choose_pairs("sequential", names, chain(150), 10, False)
-    assert says.endswith(" 0 pairs that may be revisits") and max(j - i for i, j in straight) == 45
 
 
 def test_look_alikes_are_found_by_their_features(tmp_path):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import corridor
 import cv2
 import numpy as np
@@ -11,17 +9,17 @@ import pycolmap
 import pytest
 
 from mmpi_ns.utils.errors import InputError
-from mmpi_prepare import export, features, mapping
+from mmpi_prepare import export, features
 from mmpi_prepare.adjustment import (
     adjust,
     choose_frame,
-    fit_error,
-    is_bent,
+    keeps_focals,
+    open_focals,
     polish,
     quality,
     similarity_between,
     turns_back,
-    worth,
+    with_focals,
 )
 from mmpi_prepare.images import Photo
 from mmpi_prepare.poses import make_cameras, opencv_camera, opencv_intrinsics
@@ -39,6 +37,22 @@ def model_of(poses, *cameras):
         image = pycolmap.Image(name=f"{i}.jpg", camera_id=camera.camera_id, image_id=i + 1)
         model.add_image_with_trivial_frame(image, rigid3d(pose))
     return model
+
+
+def add_points(model, points, lens, poses, noise, random, stretch=1.0):
+    """Points that three images or more see through a lens, with keypoints that are off by so many pixels; the model has
+    them so many times as far ahead."""
+    tracks = [pycolmap.Track() for _ in points]
+    for i, image in sorted(model.images.items()):
+        local = (points - poses[i - 1, :3, 3]) @ poses[i - 1, :3, :3]
+        pixels = np.asarray(lens.img_from_cam(local)) + random.normal(0, noise, (len(points), 2))
+        seen = np.flatnonzero((local[:, 2] > 1) & ((pixels > 0) & (pixels < [lens.width, lens.height])).all(-1))
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[seen]])
+        for slot, p in enumerate(seen):
+            tracks[p].add_element(i, slot)
+    for point, track in zip(points, tracks, strict=True):
+        if track.length() > 2:
+            model.add_point3D(point * [1, 1, stretch], track, np.zeros(3, np.uint8))
 
 
 # Pairs ---------------------------------------------------------------------------------------------------------------
@@ -112,9 +126,6 @@ def test_a_straight_track_is_fitted_without_a_turn_about_itself():
     assert found.translation == pytest.approx([1, 2, 3])
 
 
-# Video ---------------------------------------------------------------------------------------------------------------
-
-
 # Lenses --------------------------------------------------------------------------------------------------------------
 
 SIZE = {"width": 200, "height": 160, "camera_id": 1}
@@ -181,29 +192,19 @@ def test_images_of_several_cameras_state_their_own_intrinsics():
 # Mapping -------------------------------------------------------------------------------------------------------------
 
 
-def found_model(images, error, width=1000):
-    return SimpleNamespace(
-        cameras={1: SimpleNamespace(width=width // 2), 2: SimpleNamespace(width=width)},
-        num_reg_images=lambda: images,
-        compute_mean_reprojection_error=lambda: error,
-    )
+def test_models_are_sorted_by_soundness_then_images_then_fit_and_large_images_may_be_off_by_more():
+    def seen_by(count, noise, size=1):
+        random, poses = np.random.default_rng(0), corridor.poses(count)
+        lens = size * np.array([150, 150, 100, 80])
+        camera = pycolmap.Camera(model="PINHOLE", width=200 * size, height=160 * size, params=lens, camera_id=1)
+        model = model_of(poses, camera)
+        points = random.uniform([-2, 6, -1], [4, 20, 4], (400, 3))
+        add_points(model, points, camera, poses, noise, random)
+        model.update_point_3d_errors()
+        return quality(model)
 
-
-def test_a_sound_model_beats_a_bent_one_with_more_images_and_errors_are_judged_by_image_size():
-    assert is_bent(found_model(9, 0.9)) and not is_bent(found_model(9, 0.7))
-    assert not is_bent(found_model(9, 1.5, width=2000)) and is_bent(found_model(9, 0.9, width=300))
-    models = [found_model(50, 0.9), found_model(30, 0.7), found_model(31, 0.7), found_model(31, 0.6)]
-    ranked = sorted(range(4), key=lambda i: quality(models[i]))
-    assert ranked == [0, 1, 2, 3]
-
-
-def test_given_intrinsics_are_left_alone_and_others_refined():
-    for refine in (False, True):
-        options = mapping.mapper_options(mapping.ATTEMPTS[1], refine, 1)
-        assert options.ba_refine_focal_length == options.ba_refine_extra_params == refine
-        assert options.mapper.abs_pose_refine_focal_length == options.mapper.abs_pose_refine_extra_params == refine
-        assert not options.ba_refine_principal_point
-        assert options.triangulation.min_angle == 0.5 and options.mapper.init_max_forward_motion == 1
+    assert seen_by(8, 0.9) < seen_by(5, 0.4) < seen_by(5, 0.2) < seen_by(6, 0.4)
+    assert not seen_by(8, 0.9)[0] and seen_by(8, 0.9, size=10)[0]
 
 
 @pytest.mark.parametrize(("tangential", "kept"), [(0.0, "SIMPLE_RADIAL"), (0.02, "OPENCV")])
@@ -215,17 +216,7 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
     poses = corridor.poses(6, bend=0.15)
     points = np.column_stack([random.uniform(-2, 4, 400), random.uniform(6, 20, 400), random.uniform(-1, 4, 400)])
     model = model_of(poses, pycolmap.Camera(model="SIMPLE_RADIAL", params=[300, 100, 80, 0.1], **SIZE))
-    tracks = [pycolmap.Track() for _ in points]
-    for i, image in sorted(model.images.items()):
-        local = (points - poses[i - 1, :3, 3]) @ poses[i - 1, :3, :3]
-        pixels = lens.img_from_cam(local) + random.normal(0, 1 / 3, (400, 2))
-        seen = np.flatnonzero((local[:, 2] > 1) & ((pixels > 0) & (pixels < [200, 160])).all(-1))
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[seen]])
-        for slot, p in enumerate(seen):
-            tracks[p].add_element(i, slot)
-    for point, track in zip(points, tracks, strict=True):
-        if track.length() > 2:
-            model.add_point3D(point, track, np.zeros(3, np.uint8))
+    add_points(model, points, lens, poses, 1 / 3, random)
     adjust(model, 1, lens=True)
     found = polish(model, 1, lens=True, full_lens=True, principal_point=False)
     (camera,) = found.cameras.values()
@@ -240,14 +231,74 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
         assert polish(model, 1, lens=True, full_lens=True, principal_point=False) is model
 
 
-def test_a_lens_that_cannot_be_is_named_and_more_terms_need_more_evidence():
-    """Terms of a tourist's photo; few keypoints and many cameras; one point that runs off."""
+def test_a_lens_that_bends_rays_back_is_named():
+    """Terms of a tourist's photo."""
     absurd = pycolmap.Camera(model="RADIAL", width=800, height=1200, params=[1000, 400, 600, 0.5, -10.8])
-    assert turns_back(absurd)
     wide = pycolmap.Camera(model="OPENCV", width=800, height=1200, params=[700, 700, 400, 600, -0.3, 0.12, 0, 0])
-    assert not turns_back(wide)
-    few, many = (SimpleNamespace(compute_num_observations=lambda n=n: n) for n in (2_000, 100_000))
-    assert worth(few, 40) < 0.96 < worth(many, 4) == 0.97
-    points = {n: SimpleNamespace(error=0.5, track=SimpleNamespace(length=lambda: 4)) for n in range(99)}
-    points[99] = SimpleNamespace(error=np.inf, track=points[0].track)
-    assert fit_error(SimpleNamespace(points3D=points)) == pytest.approx(np.sqrt(0.99 * 0.25 + 0.01 * 16))
+    assert turns_back(absurd) and not turns_back(wide)
+
+
+# EXIF's focal length where the images hardly determine one ------------------------------------------------------------
+
+TRUE, LENS = 300.0, {"model": "SIMPLE_RADIAL", "width": 200, "height": 160, "camera_id": 1}
+
+
+def a_flight(tilt, focal):
+    """A model, with a focal length that may be wrong, of nine images taken from one height, each turned back towards
+    the middle by so much; keypoints have noise of half a pixel."""
+    random, poses = np.random.default_rng(0), np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :2, 3] = 1.5 * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 2)
+    for pose in poses:
+        ahead = np.array([*(-tilt * pose[:2, 3]), 1.0]) / np.hypot(1, tilt * np.linalg.norm(pose[:2, 3]))
+        down = np.cross(ahead, [1.0, 0.0, 0.0])
+        down /= np.linalg.norm(down)
+        pose[:3, :3] = np.stack([np.cross(down, ahead), down, ahead], -1)
+    points = np.column_stack([random.uniform(-4, 4, (600, 2)), random.uniform(8, 10, 600)])
+    lens = pycolmap.Camera(params=[TRUE, 100, 80, 0.0], **LENS)
+    model = model_of(poses, pycolmap.Camera(params=[focal, 100, 80, 0.0], **LENS))
+    add_points(model, points, lens, poses, 0.5, random, focal / TRUE)
+    return model
+
+
+def noting(path, *focals, known=True):
+    """A database of features with cameras of these focal lengths."""
+    with pycolmap.Database.open(path) as database:
+        for focal in focals:
+            camera = pycolmap.Camera(params=[focal, 100, 80, 0.0], **LENS)
+            camera.has_prior_focal_length = known
+            database.write_camera(camera)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("tilt", "focal", "noted", "is_open"), [(0.0, 1.3 * TRUE, TRUE, True), (0.1, TRUE, 1.3 * TRUE, False)]
+)
+def test_only_cameras_that_all_look_the_same_way_leave_the_focal_length_open(
+    tilt, focal, noted, is_open, tmp_path, capsys
+):
+    model = a_flight(tilt, focal)
+    assert open_focals(model, noting(tmp_path / "features.db", noted), 1) == ({1: noted} if is_open else {})
+    assert ("hardly determine" in capsys.readouterr().out) == is_open
+    held = with_focals(model, {1: noted}, 1)
+    assert held.cameras[1].mean_focal_length() == noted and model.cameras[1].mean_focal_length() == focal
+
+
+def test_a_focal_length_near_that_of_exif_is_not_asked_for(tmp_path, capsys):
+    assert open_focals(a_flight(0.0, 1.05 * TRUE), noting(tmp_path / "features.db", TRUE), 1) == {}
+    assert "EXIF" not in capsys.readouterr().out
+
+
+def test_only_focal_lengths_of_exif_are_noted(tmp_path, capsys):
+    model, database = a_flight(0.0, 1.3 * TRUE), noting(tmp_path / "features.db", TRUE, known=False)
+    assert open_focals(model, database, 1) == {} and "EXIF" not in capsys.readouterr().out
+    other = noting(noting(tmp_path / "two.db", TRUE), TRUE, known=False)
+    assert open_focals(model, other, 1) == {1: TRUE}
+
+
+@pytest.mark.parametrize(
+    ("focal", "known", "keeps"), [(TRUE, True, True), (1.01 * TRUE, True, False), (TRUE, False, False)]
+)
+def test_a_kept_focal_length_is_that_of_exif(focal, known, keeps):
+    camera = pycolmap.Camera(params=[TRUE, 100, 80, 0.0], **LENS)
+    camera.has_prior_focal_length = known
+    assert keeps_focals(a_flight(0.0, focal), [camera]) == keeps
