@@ -1,4 +1,4 @@
-"""What all tests share: a small hand-made plan, one thread, and hypothesis settings that suit a busy machine."""
+"""What all tests share: a small hand-made plan, and one thread."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import hypothesis
 import pytest
 import torch
 from hand_made import make_mpi
 from tiny_scene import write_scene
 
+from mmpi_ns.ops import dispatch
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 # Of the processes that tests start too: test files run side by side, and threads that wait for each other spin.
@@ -22,8 +22,6 @@ USERS = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "mmpi_n
 CACHE = tempfile.mkdtemp(prefix="mmpi-cache-")
 os.environ["XDG_CACHE_HOME"] = CACHE
 torch.set_num_threads(1)
-hypothesis.settings.register_profile("mmpi", deadline=None, derandomize=True, print_blob=True)
-hypothesis.settings.load_profile("mmpi")
 
 
 def pytest_configure(config):
@@ -59,6 +57,13 @@ def _copy_kernels(source: Path, target: Path) -> None:
             unfinished = target / f"{path.name}.{os.getpid()}"
             shutil.copyfile(path, unfinished)
             unfinished.rename(target / path.name)
+
+
+@pytest.fixture(params=["torch", "native"])
+def form(request):
+    """Operations run in plain torch, and compiled."""
+    with dispatch.chosen(request.param):
+        yield
 
 
 @pytest.fixture

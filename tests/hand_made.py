@@ -1,14 +1,15 @@
-"""Small frames, rays and hypothesis strategies that several test files use."""
+"""Small frames, cameras and rays that several test files use."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
-from hypothesis import assume
-from hypothesis import strategies as st
 
+from mmpi_ns.data.posed_images import PosedImages
+from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.geometry import LocalRays, local_to_ndc, rotate
 from mmpi_ns.scene.plan import MPIPlan
 
@@ -74,6 +75,26 @@ def rays(origins, directions, near=0.0, far=math.inf, dtype=torch.float64):
     return tuple(torch.tensor(x, dtype=dtype) for x in (origins.copy(), directions, near * column, far * column))
 
 
+def posed(poses, pinhole, size, files=None, lens=(0.0, 0.0, 0.0, 0.0), fisheye=False):
+    """Images of one camera from several poses [N, 3, 4]; their files need not be there."""
+    files = [Path(f"{i}.png") for i in range(len(poses))] if files is None else files
+    numbers = (np.tile(np.array(row, np.float64), (len(poses), 1)) for row in (pinhole, size, lens))
+    return PosedImages(tuple(files), np.array(poses, np.float64), *numbers, fisheye)
+
+
+def observed(poses, pinhole, size, points=(), seen_by=(), seen_point=None, seen_at=None, **more):
+    """What one camera sees from several poses [N, 3, 4]; point q is keypoint q unless said otherwise."""
+    return Observations(
+        np.array(poses, np.float64),
+        *(np.tile(np.array(row, np.float64), (len(poses), 1)) for row in (pinhole, size)),
+        np.array(points, np.float64).reshape(-1, 3),
+        np.array(seen_by, np.int64),
+        np.arange(len(seen_by)) if seen_point is None else np.array(seen_point, np.int64),
+        np.zeros((len(seen_by), 2)) if seen_at is None else np.array(seen_at, np.float64).reshape(-1, 2),
+        **more,
+    )
+
+
 # Blending ------------------------------------------------------------------------------------------------------------
 
 
@@ -87,44 +108,3 @@ def random_votes(rng, samples, heads, scale):
     cover = rng.random((samples, heads)) < 0.6
     cover[np.arange(samples), own] = True
     return rng.normal(size=(samples, heads)) * scale, cover, own
-
-
-# Hypothesis ----------------------------------------------------------------------------------------------------------
-
-
-def numbers(low, high):
-    return st.floats(low, high, allow_nan=False, allow_subnormal=False)
-
-
-@st.composite
-def vectors(draw, size=3, reach=20.0):
-    return np.array([draw(numbers(-reach, reach)) for _ in range(size)])
-
-
-@st.composite
-def directions(draw):
-    """Unit vectors, axis-parallel ones among them."""
-    vector = draw(vectors(3, 1.0) | st.sampled_from([np.eye(3)[i] * s for i in range(3) for s in (1, -1)]))
-    assume(np.linalg.norm(vector) > 0.01)
-    return unit(vector)
-
-
-@st.composite
-def rotations(draw):
-    quaternion = draw(vectors(4, 1.0))
-    assume(np.linalg.norm(quaternion) > 0.01)
-    return rotation(quaternion)
-
-
-@st.composite
-def mpis(draw):
-    u0, v0 = draw(numbers(-3, 2)), draw(numbers(-3, 2))
-    near = draw(numbers(0.1, 20))
-    return make_mpi(
-        origin=tuple(float(x) for x in draw(vectors())),
-        axes=draw(rotations() | st.just(IDENTITY)),
-        near=near,
-        far=near * draw(st.sampled_from([math.inf, 1.001, 1e6]) | numbers(1.001, 50)),
-        extent=(u0, u0 + draw(numbers(0.1, 6)), v0, v0 + draw(numbers(0.1, 6))),
-        planes=draw(st.integers(2, 40)),
-    )

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from hand_made import observed
 
 from mmpi_ns.placement.observations import Observations
 
 
-def observations_of(scene, per_camera=40, seed=0, limit=None):
+def observations_of(scene, per_camera=40):
     """Training cameras of a scene and points at random pixels of theirs, with every keypoint that is really visible."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     cameras = scene.cameras
-    training = np.nonzero(~cameras.is_test)[0][:limit]
+    training = np.nonzero(~cameras.is_test)[0]
     cx, cy = cameras.center
     poses = cameras.camera_to_worlds[training]
     points = []
@@ -38,16 +39,8 @@ def observations_of(scene, per_camera=40, seed=0, limit=None):
         seen_by.append(np.full(len(index), n))
         seen_point.append(index)
         seen_at.append(pixels[index])
-    count = len(training)
-    return Observations(
-        camera_to_worlds=poses.astype(np.float64),
-        intrinsics=np.tile([cameras.focal, cameras.focal, cx, cy], (count, 1)).astype(np.float64),
-        sizes=np.tile([float(cameras.width), cameras.height], (count, 1)),
-        points=points,
-        seen_by=np.concatenate(seen_by),
-        seen_point=np.concatenate(seen_point),
-        seen_at=np.concatenate(seen_at),
-    )
+    seen = (np.concatenate(x) for x in (seen_by, seen_point, seen_at))
+    return observed(poses, [cameras.focal, cameras.focal, cx, cy], [cameras.width, cameras.height], points, *seen)
 
 
 def moved(observations: Observations, turn: np.ndarray, shift: np.ndarray, scale: float) -> Observations:

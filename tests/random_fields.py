@@ -11,7 +11,7 @@ import oracle
 import pytest
 import torch
 from hand_made import random_mpi, unit
-from nerfstudio.cameras.rays import RayBundle
+from random_scenes import bundle_of as bundle
 
 from mmpi_ns.blending import blended_optical_depth
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -56,12 +56,6 @@ def random_rays(plan, count, seed):
         for i in range(count)
     ]
     return origins, np.stack([unit(t - o) for t, o in zip(targets, origins, strict=True)])
-
-
-def bundle(origins, directions, near=0.05, far=math.inf):
-    o, d = (torch.tensor(np.atleast_2d(x), dtype=torch.float32) for x in (origins, directions))
-    column = torch.ones(len(o), 1)
-    return RayBundle(origins=o, directions=d, pixel_area=column * 1e-4, nears=near * column, fars=far * column)
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,38 @@ def write_scene(folder: Path, *, masks=False, alpha=False, sfm=True) -> Path:
     return folder
 
 
+def edit(data: Path, change) -> None:
+    """Changes the contents of transforms.json."""
+    meta = json.loads((data / "transforms.json").read_text())
+    change(meta)
+    (data / "transforms.json").write_text(json.dumps(meta))
+
+
+def expose(data: Path, factors) -> Path:
+    """Takes the images anew, as a camera with automatic exposure does: their colours times factors [8, 3]."""
+    for i, factor in enumerate(factors):
+        Image.fromarray((255 * image_of(i) * factor).round().astype(np.uint8)).save(data / "images" / name_of(i))
+    return data
+
+
+def equidistant(points):
+    """Directions [N, 3] of a fisheye at ((x - cx) / f, (cy - y) / f): the angle grows with the distance."""
+    angle = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-12)
+    return np.append(points / angle * np.sin(angle), -np.cos(angle), 1)
+
+
+def undistort(x, y, lens):
+    """Tangents whose OpenCV distortion (k1, k2, p1, p2) falls on (x, y), y down, by fixed-point iteration."""
+    k1, k2, p1, p2 = lens
+    u, v = x.copy(), y.copy()
+    for _ in range(60):
+        r2 = u * u + v * v
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        left, down = x - 2 * p1 * u * v - p2 * (r2 + 2 * u * u), y - p1 * (r2 + 2 * v * v) - 2 * p2 * u * v
+        u, v = left / radial, down / radial
+    return u, v
+
+
 def wall_points():
     """SfM points [P, 3] on the wall."""
     x, y = np.meshgrid(np.linspace(-2.6, 0.9, 9), np.linspace(-1.5, 0.5, 5))

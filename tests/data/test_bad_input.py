@@ -1,8 +1,7 @@
-"""Bad input is refused with one sentence (what, where, what to do), and nothing is lost (docs/errors.md)."""
+"""Bad input is refused with one sentence (what, where, what to do), and nothing is lost."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 
@@ -11,7 +10,7 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, name_of, write_scene
+from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, edit, name_of, write_scene
 from training_runs import datamanager, ready, trainer_config
 
 from mmpi_ns.placement.rule import place
@@ -23,13 +22,6 @@ from mmpi_priors.observe import ENOUGH_KEYPOINTS
 def data(tmp_path):
     """A tiny scene to be damaged; it has a COLMAP model."""
     return write_scene(tmp_path / "data")
-
-
-def edit(data, change):
-    """Changes the contents of transforms.json."""
-    meta = json.loads((data / "transforms.json").read_text())
-    change(meta)
-    (data / "transforms.json").write_text(json.dumps(meta))
 
 
 def refusal(action, *words, error=ValueError):
@@ -132,12 +124,6 @@ def test_placement_refuses_points_behind_every_camera(scene):
     turned = replace(observations, camera_to_worlds=observations.camera_to_worlds * np.array([-1, 1, -1, 1]))
     refusal(lambda: place(turned, PlacementConfig()), "in front", "check the poses")
     assert len(observations.seen_by) > ENOUGH_KEYPOINTS
-
-
-# Crops ---------------------------------------------------------------------------------------------------------------
-
-
-# Checkpoints ---------------------------------------------------------------------------------------------------------
 
 
 # Devices, and the command as a whole ---------------------------------------------------------------------------------

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from PIL import Image
-from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, write_scene
+from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, expose, write_scene
 from training_runs import datamanager, in_capture_frame
 
 from mmpi_ns.data.datamanager import CAPTURE
@@ -20,11 +19,7 @@ FACTORS = np.random.default_rng(3).uniform(0.55, 1.0, (8, 3))
 
 @pytest.fixture(scope="module")
 def exposed(tmp_path_factory):
-    """The tiny scene as a camera with automatic exposure and white balance takes it."""
-    folder = write_scene(tmp_path_factory.mktemp("exposed"))
-    for i in range(8):
-        Image.fromarray((255 * image_of(i) * FACTORS[i]).round().astype(np.uint8)).save(folder / "images" / name_of(i))
-    return folder
+    return expose(write_scene(tmp_path_factory.mktemp("exposed")), FACTORS)
 
 
 @pytest.fixture(scope="module")

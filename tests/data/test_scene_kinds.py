@@ -12,7 +12,21 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.scannet_dataparser import ScanNetDataParserConfig
 from PIL import Image
-from tiny_scene import FOCAL, HEIGHT, TEST, TRAIN, WIDTH, color_of, name_of, pixel_rays, pose_of, write_scene
+from tiny_scene import (
+    FOCAL,
+    HEIGHT,
+    TEST,
+    TRAIN,
+    WIDTH,
+    color_of,
+    edit,
+    equidistant,
+    name_of,
+    pixel_rays,
+    pose_of,
+    undistort,
+    write_scene,
+)
 from training_runs import datamanager, in_capture_frame, ready, trainer_config
 
 STEPS = 80
@@ -29,37 +43,12 @@ def repaint(data, i, rays, width=WIDTH, height=HEIGHT, alpha=None):
     Image.fromarray(image).save(data / "images" / name_of(i))
 
 
-def edit(data, change):
-    meta = json.loads((data / "transforms.json").read_text())
-    change(meta)
-    (data / "transforms.json").write_text(json.dumps(meta))
-
-
 LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.01, "p2": -0.008}
 
 
-def opencv_undistort(points):
-    """OpenCV's lens (y down), inverted by fixed-point iteration."""
-    target, p = points * [1, -1], points * [1, -1]
-    for _ in range(60):
-        x, y = p.T
-        r = x * x + y * y
-        radial = (1 + LENS["k1"] * r + LENS["k2"] * r * r)[:, None]
-        tangential = np.stack(
-            [
-                2 * LENS["p1"] * x * y + LENS["p2"] * (r + 2 * x * x),
-                LENS["p1"] * (r + 2 * y * y) + 2 * LENS["p2"] * x * y,
-            ],
-            -1,
-        )
-        p = (target - tangential) / radial
-    return np.append(p * [1, -1], -np.ones((len(p), 1)), 1)
-
-
-def equidistant(points):
-    """A fisheye: the angle from the axis grows with the distance from the centre."""
-    angle = np.linalg.norm(points, axis=-1, keepdims=True)
-    return np.append(points / angle * np.sin(angle), -np.cos(angle), 1)
+def through_lens(points):
+    x, y = undistort(points[:, 0], -points[:, 1], LENS.values())
+    return np.stack([x, -y, -np.ones_like(x)], -1)
 
 
 def plain(data):
@@ -68,7 +57,7 @@ def plain(data):
 
 def lens(data):
     for i in range(8):
-        repaint(data, i, pixel_rays(undistort=opencv_undistort))
+        repaint(data, i, pixel_rays(undistort=through_lens))
     edit(data, lambda meta: meta.update(LENS))
     return NerfstudioDataParserConfig()
 

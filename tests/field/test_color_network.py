@@ -7,12 +7,9 @@ from itertools import pairwise
 
 import pytest
 import torch
+from compiled import normal
 
 from mmpi_ns.field.shading import ColorNetworks
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 def encoded(x, octaves):

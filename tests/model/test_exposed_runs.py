@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
-from PIL import Image
-from tiny_scene import image_of, name_of, write_scene
+from tiny_scene import expose, write_scene
 from training_runs import ready, trainer_config, write_plan
 
 from mmpi_ns.training.report import quick_test
@@ -19,9 +18,7 @@ FACTORS = np.random.default_rng(3).uniform(0.55, 1.0, (8, 3))
 def run(tmp_path_factory):
     """A pipeline loaded from a short run on the tiny scene, each image of which has an exposure of its own."""
     folder = tmp_path_factory.mktemp("exposed")
-    data = write_scene(folder / "data")
-    for i in range(8):
-        Image.fromarray((255 * image_of(i) * FACTORS[i]).round().astype(np.uint8)).save(data / "images" / name_of(i))
+    data = expose(write_scene(folder / "data"), FACTORS)
     plan = write_plan(data, folder / "plan.json")
     config = trainer_config(data, plan, folder / "runs", 60, training="joint", lpips_net="none")
     config.pipeline.datamanager.new_view_share = 0.75

@@ -7,11 +7,16 @@ import math
 import pytest
 import torch
 from bricked import bricked_field
-from hand_made import make_mpi
+from compiled import both, normal
 from hard_rays import HARD_RAYS, hard_plan, hard_rays
-from interpreting import by_torch, interpreted, normal  # noqa: F401
+from interpreting import interpreted  # noqa: F401
 from kernel_cases import CASES, CLOSE, Shapes, differences
-from random_fields import bundle, random_field, random_rays, render, sampled
+from marches import (
+    behind_an_opaque_plane_nothing_is_visited_and_a_hundred_thousandth_is_lost,
+    compare,
+    nothing_is_marched_without_rays_or_samples,
+)
+from random_fields import bundle, random_field, random_rays, sampled
 from random_scenes import dense_grad
 from shows import compare as compare_shown
 from shows import nothing_is_shown_of_nothing
@@ -22,7 +27,6 @@ from mmpi_ns.ops import composite, interpolate
 from mmpi_ns.ops.adam import AdamConstants, adam_rows
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import gpu
-from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 
 
@@ -100,33 +104,6 @@ def test_adam_on_rows_is_that_of_float64_and_leaves_the_rest_alone(channels, dty
 # March ---------------------------------------------------------------------------------------------------------------
 
 
-def compare(field, rays, threshold, blends=False, **chosen):
-    """The kernel's samples are the reference's; returns the kernel's rendering and the reference's."""
-    fast = render(field, rays, threshold, blends, **chosen)
-    plain = by_torch(lambda: render(field, rays, threshold, blends, **chosen))
-    kept, wanted = vars(fast.samples), vars(plain.samples)
-    assert kept["valid"].shape == wanted["valid"].shape
-    # A sample whose weight is the threshold's to the last bits may fall on either side of it.
-    same = kept["valid"].sum(1) == wanted["valid"].sum(1)
-    assert same.float().mean() >= 0.95
-    valid = wanted["valid"][same]
-    for name, error in (("heads", 0), ("planes", 0), ("ndc", 2e-6), ("inverse_t", 3e-5), ("tau", 2e-5)):
-        a, b = (m[name][same][valid].double() for m in (kept, wanted))
-        assert ((a - b).abs() <= error * (1 + b.abs())).all(), name
-        assert kept[name].dtype == wanted[name].dtype
-        assert (kept[name][~kept["valid"][..., 0]] == 0).all(), "empty slots are 0"
-    before = [m["skipped_before"][same][valid] for m in (kept, wanted)]
-    assert torch.allclose(*before, atol=2e-5)
-    assert torch.equal(fast.samples.live, plain.samples.live)
-    assert torch.equal(fast.samples.explained, plain.samples.explained)
-    difference = (fast.samples.dropped_mass - plain.samples.dropped_mass)[same]
-    if difference.numel():
-        assert difference.min() > -2e-6 and difference.max() < 1.2e-5, "what is not visited counts as dropped"
-        assert (fast.composite.transmittance - plain.composite.transmittance).abs()[same].max() < 1.2e-5
-        assert (fast.rgb - plain.rgb).abs()[same].max() < 3e-5
-    return fast, plain
-
-
 @pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("threshold", [0.0, 1e-2])
 def test_the_march_keeps_what_the_reference_keeps(monkeypatch, blends, threshold):
@@ -163,20 +140,12 @@ def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monke
     assert fast.samples.live[names.index("along the planes")] == 0 and fast.samples.live[names.index("backwards")] > 0
 
 
-def test_behind_an_opaque_plane_the_march_visits_nothing_and_loses_a_hundred_thousandth():
-    field = MMPIField(ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)).eval()
-    field.density.data[field.grids[0].rows[: 10 * field.grids[0].height * field.grids[0].width]] = 30.0
-    found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
-    assert found.samples.live.item() == 64 and found.samples.valid.sum() == 1
-    assert found.samples.skipped_total.item() == 0 and found.samples.dropped_mass.item() <= 1e-5
+def test_behind_an_opaque_plane_the_march_visits_nothing():
+    behind_an_opaque_plane_nothing_is_visited_and_a_hundred_thousandth_is_lost()
 
 
 def test_without_rays_or_samples_there_is_nothing_to_march():
-    field = MMPIField(ScenePlan((make_mpi(),), None, 0.05, 1.0)).eval()
-    away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blends=True)
-    assert away.samples.valid.sum() == 0 and away.composite.accumulation.item() == 0
-    _, samples = sampled(field, bundle(torch.zeros(0, 3), torch.zeros(0, 3)), 1e-3)
-    assert samples.valid.shape[0] == 0 and samples.live.shape == (0,)
+    nothing_is_marched_without_rays_or_samples()
 
 
 def test_densities_that_are_no_numbers_end_the_march_all_the_same():
@@ -204,7 +173,7 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
         (loss + 0.1 * field.total_variation(lookup, 1.0, 1.0)).backward()
         return {n: dense_grad(p) if isinstance(p, Table) else p.grad for n, p in params.items()}
 
-    fast, plain = gradients(), by_torch(gradients)
+    fast, plain = both(gradients)
     for name in ("density", "features", "reliability", "networks.weights"):
         size = plain[name].abs().max()
         assert size > 1e-3 and (fast[name] - plain[name]).abs().max() < 2e-4 * size, name

@@ -18,13 +18,3 @@ def interpreted(monkeypatch):
     assert dispatch.form_of(march.name, torch.zeros(1)) == "gpu"
     yield
     interpret(False)
-
-
-def by_torch(work):
-    """What ``work`` returns by plain torch."""
-    with dispatch.chosen("torch"):
-        return work()
-
-
-def normal(*shape, seed=0, dtype=torch.float32):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)

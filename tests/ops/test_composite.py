@@ -1,4 +1,5 @@
-"""Merged transmittance, sample by sample, and what a ray gathers (ops/composite)."""
+"""Merged transmittance, sample by sample, and what a ray gathers; the compiled form against float64, also on hard rays
+(ops/composite)."""
 
 from __future__ import annotations
 
@@ -8,14 +9,16 @@ import numpy as np
 import oracle
 import pytest
 import torch
+from compiled import compiled  # noqa: F401
 from hand_made import tensor
 
-from mmpi_ns.ops.composite import composite_weights, exclusive_cumsum, median_inverse_distance, render_colors
-
-
-def composite_all(tau, valid=None):
-    valid = torch.ones_like(tau, dtype=torch.bool) if valid is None else valid
-    return composite_weights.reference(tau, valid, torch.zeros_like(tau), torch.zeros_like(tau[:, :1]))
+from mmpi_ns.ops.composite import (
+    Composite,
+    composite_weights,
+    exclusive_cumsum,
+    median_inverse_distance,
+    render_colors,
+)
 
 
 def test_exclusive_cumsum_sums_what_came_before():
@@ -26,33 +29,11 @@ def test_exclusive_cumsum_sums_what_came_before():
 
 def test_weights_of_a_hand_computed_ray():
     tau = tensor([[math.log(2), math.log(4), 0.0, math.log(2)]])  # alpha 1/2, 3/4, 0, 1/2
-    composite = composite_all(tau)
+    nothing, everything = torch.zeros_like(tau), torch.ones_like(tau, dtype=torch.bool)
+    composite = composite_weights.reference(tau, everything, nothing, nothing[:, :1])
     assert composite.weights[0].tolist() == pytest.approx([1 / 2, 3 / 8, 0, 1 / 16])
     assert composite.transmittance.item() == pytest.approx(1 / 16)
     assert composite.accumulation.item() == pytest.approx(15 / 16)
-
-
-def test_alpha_one_everywhere_stops_at_the_first_sample():
-    composite = composite_all(torch.full((2, 50), 1e4))
-    assert composite.weights[:, 0].tolist() == [1.0, 1.0] and composite.weights[:, 1:].abs().sum() == 0
-    assert composite.accumulation.tolist() == [[1.0]] * 2 and composite.transmittance.tolist() == [[0.0]] * 2
-
-
-def test_dropped_samples_keep_their_transmittance():
-    rng = np.random.default_rng(2)
-    tau = rng.exponential(0.2, size=40)
-    kept = rng.random(40) < 0.5
-    whole = oracle.composite(tau)
-    before = np.array([tau[:i][~kept[:i]].sum() for i in np.flatnonzero(kept)])
-    composite = composite_weights.reference(
-        tensor(tau[kept])[None],
-        torch.ones(1, int(kept.sum()), dtype=torch.bool),
-        tensor(before)[None],
-        tensor([[tau[~kept].sum()]]),
-    )
-    assert np.allclose(composite.weights[0], whole.weights[kept], rtol=1e-12)
-    assert composite.accumulation.item() == pytest.approx(whole.accumulation)
-    assert composite.transmittance.item() == pytest.approx(whole.transmittance)
 
 
 def test_dropped_mass_takes_the_mean_colour_of_what_was_kept():
@@ -80,4 +61,69 @@ def test_median_distance_is_where_half_of_the_gathered_weight_is_reached():
     assert median[:, 0].tolist() == [2.0, 3.0, 0.0, 2.0, 0.0]
 
 
-# A whole ray ---------------------------------------------------------------------------------------------------------
+# Compiled -------------------------------------------------------------------------------------------------------------
+
+
+def batch(rays=60, slots=37):
+    """Optical depths from 1e-7 to 1e3, some exactly 0, in rays of 0 to all slots, with dropped samples between them."""
+    g = torch.Generator().manual_seed(rays)
+    tau = 10 ** (torch.rand(rays, slots, generator=g) * torch.linspace(1, 10, rays)[:, None] - 7)
+    tau[torch.rand(rays, slots, generator=g) < 0.05] = 0
+    count = torch.randint(0, slots + 1, (rays,), generator=g)
+    count[:2] = torch.tensor([0, slots])
+    valid = torch.arange(slots) < count[:, None]
+    skipped = 0.01 * torch.rand(rays, slots, generator=g).cumsum(-1)
+    return tau, valid, skipped, skipped[:, -1:] + 0.02
+
+
+def weights_and_gradient(function, given, dtype):
+    tau, valid, before, total = given
+    tau = tau.detach().to(dtype).requires_grad_()
+    made = function(tau, valid, before.to(dtype), total.to(dtype))
+    g = torch.Generator().manual_seed(1)
+    parts = (made.weights, made.accumulation, made.transmittance)
+    sum((p * torch.randn(p.shape, generator=g)).sum() for p in parts).backward()
+    return (*(p.detach() for p in parts), tau.grad)
+
+
+@pytest.mark.parametrize("slots", [1, 16, 37])
+def test_weights_and_their_gradient_equal_float64(slots):
+    given = batch(slots=slots)
+    found = weights_and_gradient(composite_weights, given, torch.float32)
+    wanted = weights_and_gradient(composite_weights.reference, given, torch.float64)
+    for a, b in zip(found, wanted, strict=True):
+        assert ((a.double() - b).abs() <= 3e-6 * (1 + b.abs().amax(-1, keepdim=True))).all()
+    assert (found[0][~given[1]] == 0).all() and (found[3][~given[1]] == 0).all()
+    thin = (given[0] < 1e-4) & (wanted[0] > 0.5 * given[0]) & (given[0] > 0)
+    assert thin.any() and ((found[0].double() - wanted[0]).abs()[thin] <= 1e-5 * wanted[0][thin]).all()
+
+
+def test_opaque_and_infinite_samples_hide_what_lies_behind():
+    tau = torch.tensor([[0.1, 200.0, 3.0], [math.inf, 1.0, 1.0]], requires_grad=True)
+    made = composite_weights(tau, torch.ones(2, 3, dtype=torch.bool), torch.zeros(2, 3), torch.zeros(2, 1))
+    wanted = torch.tensor([[1 - math.exp(-0.1), math.exp(-0.1), 0.0], [1.0, 0.0, 0.0]])
+    assert torch.allclose(made.weights, wanted, atol=1e-6)
+    assert made.transmittance.tolist() == [[0.0], [0.0]] and made.accumulation.tolist() == [[1.0], [1.0]]
+    made.weights[:, 2].sum().backward()
+    assert tau.grad.isfinite().all() and tau.grad.abs().max() < 1e-30
+
+
+def test_a_depth_that_is_not_a_number_is_not_hidden():
+    tau = torch.tensor([[0.1, math.nan, 0.3], [0.1, 0.2, 0.3]])
+    made = composite_weights(tau, torch.ones(2, 3, dtype=torch.bool), torch.zeros(2, 3), torch.zeros(2, 1))
+    assert made.weights[0, 1].isnan() and made.accumulation[0].isnan() and made.transmittance[0].isnan()
+    assert made.weights[1].isfinite().all() and render_colors(made, torch.ones(2, 3, 3))[0].isnan().all()
+
+
+def test_colours_of_rays_and_their_gradients_equal_float64():
+    given, g = batch(), torch.Generator().manual_seed(2)
+    colors, upstream = torch.rand(60, 37, 3, generator=g), torch.randn(60, 3, generator=g)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        made = composite_weights.reference(*(x.to(dtype) if x.is_floating_point() else x for x in given))
+        weights, own = made.weights.requires_grad_(), colors.detach().to(dtype).requires_grad_()
+        rgb = render_colors(Composite(weights, made.accumulation, made.transmittance), own)
+        (rgb * upstream).sum().backward()
+        found.append((rgb.detach(), weights.grad, own.grad))
+    for a, b in zip(*found, strict=True):
+        assert b.abs().max() > 0.1 and ((a.double() - b).abs() <= 2e-5 * b.abs() + 2e-6).all()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.depth_sums import depth_sums
 
 HARD = {
@@ -58,15 +57,14 @@ def oracle(weights, inverse_t, valid, intervals, targets, scale):
     return spread, mass, reached, d_spread, d_mass
 
 
-@pytest.mark.parametrize("form", ["torch", "native"])
+@pytest.mark.usefixtures("form")
 @pytest.mark.parametrize("case", HARD)
-def test_sums_and_gradients_equal_the_double_loops(form, case):
+def test_sums_and_gradients_equal_the_double_loops(case):
     *arrays, scale = rays(**HARD[case])
     spread, mass, reached, d_spread, d_mass = oracle(*(x.astype(np.float64) for x in arrays[:2]), *arrays[2:], scale)
     tensors = [torch.from_numpy(x) if x.dtype == bool else torch.from_numpy(x).float() for x in arrays]
     weights = tensors[0].requires_grad_()
-    with dispatch.chosen(form):
-        sums = depth_sums(weights, *tensors[1:], scale)
+    sums = depth_sums(weights, *tensors[1:], scale)
     np.testing.assert_allclose(sums.spread.detach(), spread, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(sums.mass.detach(), mass, rtol=2e-3, atol=1e-5)
     # float32 may place a sample at exactly three widths on either side

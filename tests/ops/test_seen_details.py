@@ -10,18 +10,12 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.details import FADE, HERE, MIDDLE, SAME_DEPTH, SAME_PIXELS, TURN, project, seen_details
 
 LENS = [0.08, -0.02, 0.004, 0.0, 0.003, -0.002]
 HEIGHT, WIDTH = 20, 28
 KINDS = [CameraType.PERSPECTIVE, CameraType.FISHEYE]
-
-
-@pytest.fixture(params=["torch", "native"], autouse=True)
-def form(request):
-    with dispatch.chosen(request.param):
-        yield
+pytestmark = pytest.mark.usefixtures("form")
 
 
 def camera(x=0.0, y=0.0, z=0.0, turn=0.0, kind=CameraType.PERSPECTIVE, lens=None) -> Cameras:

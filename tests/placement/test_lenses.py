@@ -7,24 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hand_made import observed
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from test_borders import holds
+from tiny_scene import equidistant
 
 from mmpi_ns.data.rays import lens_directions
-from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import place
 from mmpi_ns.settings import PlacementConfig
 from mmpi_ns.utils.errors import InputError
 
-SIDE, COUNT = 160, 10
+COUNT = 10
 
 
-def equidistant(points):
-    """Directions [N, 3] of a fisheye at ((x - cx) / f, (cy - y) / f): the angle grows with the distance."""
-    angle = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-12)
-    return np.append(points / angle * np.sin(angle), -np.cos(angle), 1)
-
-
-def walk(degrees, width=SIDE, height=SIDE * 3 // 4):
+def walk(degrees, width=160, height=120):
     """Fisheyes of so many degrees across on a walk through a hall, and points on its walls that each sees."""
     focal = (width / 2) / np.radians(degrees / 2)
     centers = np.stack([np.linspace(0, 1.5, COUNT), 0.1 * np.sin(np.arange(COUNT)), np.zeros(COUNT)], -1)
@@ -39,12 +35,8 @@ def walk(degrees, width=SIDE, height=SIDE * 3 // 4):
     reach = np.minimum(3 / np.abs(directions).max(-1, keepdims=True), 9)  # a room of 6 x 6 x 6 about each camera
     points = (centers[:, None] + directions * reach * rng.uniform(0.7, 1, (COUNT, 300, 1))).reshape(-1, 3)
     seen = np.repeat(np.arange(COUNT), 300)
-    intrinsics = np.tile([focal, focal, width / 2, height / 2], (COUNT, 1))
-    sizes = np.tile([float(width), height], (COUNT, 1))
-    found = Observations(
-        poses, intrinsics, sizes, points, seen, np.arange(len(points)), at.reshape(-1, 2), lens_directions(cameras)
-    )
-    return found, cameras
+    pinhole, lens = [focal, focal, width / 2, height / 2], lens_directions(cameras)
+    return observed(poses, pinhole, [width, height], points, seen, seen_at=at, lens=lens), cameras
 
 
 def share_in_no_mpi(plan, cameras, distance):
@@ -53,12 +45,7 @@ def share_in_no_mpi(plan, cameras, distance):
     for i in range(len(cameras)):
         rays = cameras.generate_rays(camera_indices=i)
         points = (rays.origins + distance * rays.directions).double().reshape(-1, 3).numpy()
-        held = np.zeros(len(points), dtype=bool)
-        for mpi in plan.mpis:
-            x, y, z = ((points - mpi.origin) @ np.array(mpi.axes).T).T
-            u0, u1, v0, v1 = mpi.extent
-            held |= (z >= mpi.near) & (x >= u0 * z) & (x <= u1 * z) & (y >= v0 * z) & (y <= v1 * z)
-        lost.append(1 - held.mean())
+        lost.append(1 - np.any([holds(mpi, points) for mpi in plan.mpis], axis=0).mean())
     return np.mean(lost)
 
 

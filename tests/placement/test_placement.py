@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import hand_made
 import numpy as np
 import pytest
 from reprojection import median_reprojection_error
@@ -34,16 +35,8 @@ def observed(centers: np.ndarray, points: np.ndarray, axes: np.ndarray = OPENGL)
         seen_by.append(np.full(len(index), i))
         seen_point.append(index)
         seen_at.append(np.stack([x, y], -1)[index])
-    count = len(centers)
-    return Observations(
-        camera_to_worlds=poses,
-        intrinsics=np.tile([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], (count, 1)),
-        sizes=np.tile([WIDTH, HEIGHT], (count, 1)),
-        points=points,
-        seen_by=np.concatenate(seen_by),
-        seen_point=np.concatenate(seen_point),
-        seen_at=np.concatenate(seen_at),
-    )
+    seen = (np.concatenate(x) for x in (seen_by, seen_point, seen_at))
+    return hand_made.observed(poses, [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], [WIDTH, HEIGHT], points, *seen)
 
 
 def street(count: int = 21, length: float = 40.0) -> Observations:

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from seen_points import FX, FY, HEIGHT, WIDTH, mpi, observed, turned_about_y
+from hand_made import observed
 
-from mmpi_ns.placement.candidates import Candidate, find_candidates
+from mmpi_ns.placement.candidates import find_candidates
 from mmpi_ns.placement.errors import mpi_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
+from mmpi_ns.placement.rule import widened
+from mmpi_ns.scene.plan import MPIPlan
+
+FX, FY, WIDTH, HEIGHT = 150.0, 100.0, 200, 100
+AXES = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+"""Of an MPI that looks as a camera without rotation does: along -z, y up."""
+
+
+def seen_from(centers, points, seen_by, seen_point=None, turns=None) -> Observations:
+    """By cameras that look along -z unless turned."""
+    turns = np.tile(np.eye(3), (len(centers), 1, 1)) if turns is None else turns
+    poses = np.concatenate([turns, np.array(centers, np.float64)[:, :, None]], -1)
+    return observed(poses, [FX, FY, WIDTH / 2, HEIGHT / 2], [WIDTH, HEIGHT], points, seen_by, seen_point)
 
 
 def test_content_starts_for_each_camera_where_its_own_points_do():
     depths = [np.linspace(10, 20, 40), np.linspace(100, 200, 40), np.full(5, 40.0)]
     centers = np.array([[0.0, 0, 0], [30, 0, 0], [60, 0, 0]])
     points = np.concatenate([c - d[:, None] * [0, 0, 1] for c, d in zip(centers, depths, strict=True)])
-    visible = find_visible_points(observed(centers, points, np.repeat([0, 1, 2], [40, 40, 5])))
+    visible = find_visible_points(seen_from(centers, points, np.repeat([0, 1, 2], [40, 40, 5])))
     assert visible.near == pytest.approx(55)  # the median of 10 and 100; the third camera has too few of its own
     assert visible.nearest == pytest.approx([10, 100, 55])
     # The third takes the quantiles of all 85: the 22nd, and 0.6 beyond the 31st of the second's.
@@ -29,7 +44,7 @@ def test_content_starts_for_each_camera_where_its_own_points_do():
 
 def test_planes_begin_a_little_before_the_content_of_the_camera_or_of_all_where_that_is_nearer():
     depths = np.repeat([10.0, 100.0], 40)
-    observations = observed([[0.0, 0, 0], [30, 0, 0]], [[0, 0, -d] for d in depths], np.repeat([0, 1], 40))
+    observations = seen_from([[0.0, 0, 0], [30, 0, 0]], [[0, 0, -d] for d in depths], np.repeat([0, 1], 40))
     visible = find_visible_points(observations)
     assert visible.near == 55
     found = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, visible)}
@@ -39,17 +54,12 @@ def test_planes_begin_a_little_before_the_content_of_the_camera_or_of_all_where_
     })  # fmt: skip
 
 
-def orbit(inwards: int = 16) -> Observations:
-    """Sixteen cameras on a circle of radius 4; so many look at keypoints around its centre, the others away from it."""
-    turns = turned_about_y(2 * np.pi * np.arange(16) / 16)
-    centers = 4 * turns[:, :, 2]
-    turns[inwards:] *= [-1, 1, -1]
-    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
-    return observed(centers, points, np.repeat(np.arange(inwards), 40), np.tile(np.arange(40), inwards), turns)
-
-
 def test_a_candidates_errors_are_those_of_the_mpi_made_of_it():
-    observations = orbit()
+    """Sixteen cameras on a circle of radius 4 look at keypoints around its centre."""
+    angles, points = 2 * np.pi * np.arange(16) / 16, np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    turns = np.array([[[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]] for a in angles])
+    seen_by, seen_point = np.divmod(np.arange(16 * 40), 40)
+    observations = seen_from(4 * turns[:, :, 2], points, seen_by, seen_point, turns)
     visible = find_visible_points(observations)
     candidates = find_candidates(observations, visible)
     seen = 0
@@ -66,13 +76,6 @@ def test_a_candidates_errors_are_those_of_the_mpi_made_of_it():
     assert seen > 50
 
 
-def candidate(texel, plane=None, rows=100.0, frame=None) -> Candidate:
-    """What it costs each observation: pixels of a texel, and of two planes."""
-    texel = np.asarray(texel, np.float32)
-    plane = np.zeros(len(texel), np.float32) if plane is None else np.asarray(plane, np.float32)
-    return Candidate(frame or mpi(), rows, rows, plane, texel)
-
-
 def test_pixels_that_see_a_pixels_content_are_those_of_all_images_by_their_magnification():
     random = np.random.default_rng(3)
     centers = random.uniform([-6, -3, -2], [6, 3, 2], (7, 3))
@@ -82,7 +85,7 @@ def test_pixels_that_see_a_pixels_content_are_those_of_all_images_by_their_magni
     seen = (np.abs(offset[:, 0] * FX) < -offset[:, 2] * WIDTH / 2) & (
         np.abs(offset[:, 1] * FY) < -offset[:, 2] * HEIGHT / 2
     )
-    observations = observed(centers, points[numbers[seen]], cameras[seen])
+    observations = seen_from(centers, points[numbers[seen]], cameras[seen])
     visible = find_visible_points(observations)
     covered = []
     for camera, point in zip(visible.cameras, visible.points, strict=True):
@@ -96,3 +99,17 @@ def test_pixels_that_see_a_pixels_content_are_those_of_all_images_by_their_magni
     share = np.cumsum(visible.weights[order]) / visible.weights.sum()
     assert pixels_per_pixel(observations, visible) == pytest.approx(max(1, covered[order[(share >= 0.25).argmax()]]))
     assert 1.2 < pixels_per_pixel(observations, visible) < 7
+
+
+def test_a_border_goes_to_the_mpi_that_must_grow_least_and_texels_keep_their_size_both_ways():
+    observations = seen_from([[0.0, 0, 0]], [[0.0, 0, -10]] * 30, np.zeros(30))
+    whole = (-WIDTH / 2 / FX, WIDTH / 2 / FX, -HEIGHT / 2 / FY, HEIGHT / 2 / FY)
+    close = MPIPlan("front", (0.0, 0.0, 0.0), AXES, 2.0, whole, 33, 61, 81)
+    narrow = replace(close, extent=tuple(0.7 * x for x in whole))
+    got = widened([narrow, close], observations, find_visible_points(observations))
+    assert got[0] == narrow
+    assert got[1].extent == pytest.approx([1.1 * x for x in whole])
+    assert (got[1].height - 1) / (close.height - 1) == pytest.approx(1.1, rel=0.01)
+    far = replace(close, near=11.0)  # begins behind the content, so it holds none of it
+    got = widened([narrow, far], observations, find_visible_points(observations))
+    assert got[1] == far and got[0].extent == pytest.approx([1.1 * x for x in whole])

@@ -3,12 +3,10 @@ from how large a mask on anything counts."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from hand_made import posed
 
-from mmpi_ns.data.posed_images import PosedImages
 from mmpi_priors import moving
 from mmpi_priors.dense import Depth
 from mmpi_priors.moving import find_moving, key_images
@@ -20,9 +18,7 @@ def aside(*places):
     """Cameras before a wall, so far from the first as its points shift in the image, in widths."""
     poses = np.tile(np.eye(4)[:3], (len(places), 1, 1))
     poses[:, 0, 3] = places
-    pinhole, size = np.tile([100.0, 100, 50, 25], (len(places), 1)), np.tile([100.0, 50], (len(places), 1))
-    files = tuple(map(Path, map(str, range(len(places)))))
-    return PosedImages(files, poses, pinhole, size, np.zeros((len(places), 4)))
+    return posed(poses, [100, 100, 50, 25], [100, 50])
 
 
 def wall(count=40):

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from hand_made import observed, posed
 
-from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.data.priors import UNKNOWN, DepthPriors, packed
-from mmpi_ns.placement.observations import Observations
 from mmpi_priors.dense import Depth
 from mmpi_priors.depth_priors import POINT_ERROR, SENSOR_ERROR, at_training_pixels, with_points, with_sensor
 from mmpi_priors.views import View
@@ -23,9 +21,7 @@ WIDTH, HEIGHT = 80, 60
 
 
 def camera(lens=(0.0, 0.0, 0.0, 0.0), fisheye=False):
-    intrinsics = np.array([[60.0, 60.0, 40.0, 30.0]])
-    pose, sizes = np.eye(4)[None, :3], np.array([[float(WIDTH), HEIGHT]])
-    return PosedImages(("x.png",), pose, intrinsics, sizes, np.array([lens]), fisheye)  # type: ignore[arg-type]
+    return posed(np.eye(4)[None, :3], [60, 60, 40, 30], [WIDTH, HEIGHT], lens=lens, fisheye=fisheye)
 
 
 def photographed(folder):
@@ -44,11 +40,11 @@ def slanted(pinhole, shape):
                                                ((0.08, -0.03, 0.02, 0.01), True), ((0, 0, 0, 0), True)])  # fmt: skip
 def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):
     """Oracle: the training pixels' rays by OpenCV's own lens model, met with the plane."""
-    posed = camera(lens, fisheye)
-    pinhole, shape = posed.intrinsics[0], (HEIGHT, WIDTH)
+    image = camera(lens, fisheye)
+    pinhole, shape = image.intrinsics[0], (HEIGHT, WIDTH)
     inverse = slanted(pinhole, shape).astype(F32)
-    view = View(np.zeros(shape, np.uint8), pinhole, posed.camera_to_worlds[0], np.ones(shape, bool))
-    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (15, 20))
+    view = View(np.zeros(shape, np.uint8), pinhole, image.camera_to_worlds[0], np.ones(shape, bool))
+    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), image, 0, (15, 20))
     rows, columns = np.meshgrid(np.arange(15) + 0.5, np.arange(20) + 0.5, indexing="ij")
     at = np.stack([columns * 4, rows * 4], -1).reshape(-1, 1, 2)
     matrix = np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]])
@@ -63,12 +59,11 @@ def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):
 
 def test_a_copy_whose_size_was_rounded_shows_the_whole_original():
     """1242 x 375 as 310 x 93: pixel 300 of the copy lies at 300.5 * 1242/310 of the original."""
-    camera = np.array([[720.0, 720, 610, 170]]), np.array([[1242.0, 375]]), np.zeros((1, 4))
-    posed = PosedImages((Path("x.png"),), np.eye(4)[None, :3], *camera)
+    image = posed(np.eye(4)[None, :3], [720, 720, 610, 170], [1242, 375])
     shape, pinhole = (188, 621), np.array([720.0 * 621 / 1242, 720.0 * 188 / 375, 610 * 621 / 1242, 170 * 188 / 375])
     inverse = slanted(pinhole, shape).astype(F32)
     view = View(np.zeros(shape, np.uint8), pinhole, np.eye(4)[:3], np.ones(shape, bool))
-    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (93, 310))
+    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), image, 0, (93, 310))
     u, v = (300.5 * 1242 / 310 - 610) / 720, (10.5 * 375 / 93 - 170) / 720
     # The pixel that is looked up lies within half a training pixel of the exact place.
     assert found[10, 300, 0] == pytest.approx((0.5 + 0.2 * u + 0.1 * v) / np.sqrt(u * u + v * v + 1), rel=3e-3)
@@ -79,10 +74,10 @@ def test_areas_take_the_mean_by_certainty_and_edges_have_large_errors():
     inverse[:, 4:6], error[:, 5] = 0.1, 0.01  # an edge inside the third area of 2 x 2: none; inside the fourth: below
     inverse[:2, 7] = 0.9
     inverse[2:, :3], error[2:, :3] = 0, 0
-    pinhole, pose, size = np.array([1e6, 1e6, 4, 2]), np.eye(4)[:3], np.array([[8.0, 4]])  # all along the axis
+    pinhole, pose = np.array([1e6, 1e6, 4, 2]), np.eye(4)[:3]  # all along the axis
     view = View(np.zeros((4, 8), np.uint8), pinhole, pose, np.ones((4, 8), bool))
-    posed = PosedImages((Path("x.png"),), pose[None], pinhole[None], size, np.zeros((1, 4)))
-    mean, spread = np.moveaxis(at_training_pixels(view, Depth(inverse, error), posed, 0, (2, 4)), -1, 0)
+    image = posed(pose[None], pinhole, [8, 4])
+    mean, spread = np.moveaxis(at_training_pixels(view, Depth(inverse, error), image, 0, (2, 4)), -1, 0)
     assert mean[0] == pytest.approx([0.5, 0.5, 0.1, 0.7]) and spread[0, :3] == pytest.approx([0.01] * 3, rel=1e-3)
     assert spread[0, 3] == pytest.approx(np.hypot(0.2, 0.01), rel=1e-3)
     assert mean[1, 0] == 0 and mean[1, 1] == pytest.approx(0.5)  # nothing known; half of the area known
@@ -96,15 +91,7 @@ def seen(points, cameras, at):
     """Observations of a camera at the origin and one a unit behind it."""
     poses = np.tile(np.eye(4)[:3], (2, 1, 1))
     poses[1, 2, 3] = 1
-    return Observations(
-        camera_to_worlds=poses,
-        intrinsics=np.tile([60.0, 60, 40, 30], (2, 1)),
-        sizes=np.tile([80.0, 60], (2, 1)),
-        points=np.array(points, float),
-        seen_by=np.array(cameras),
-        seen_point=np.arange(len(points)),
-        seen_at=np.array(at, float),
-    )
+    return observed(poses, [60, 60, 40, 30], [80, 60], points, cameras, seen_at=at)
 
 
 def test_points_set_the_distance_of_the_pixels_that_saw_them_the_nearest_where_several_did():
@@ -123,8 +110,8 @@ def test_a_depth_image_of_a_sensor_is_along_the_axis_in_its_unit_and_0_is_unknow
     depth = np.full((HEIGHT, WIDTH), 3000, np.uint16)
     depth[:, 40:] = 0
     np.save(file, depth) if suffix == "npy" else cv2.imwrite(str(file), depth)
-    posed = photographed(tmp_path)
-    half = replace(posed, intrinsics=posed.intrinsics / 2, sizes=posed.sizes / 2)
+    image = photographed(tmp_path)
+    half = replace(image, intrinsics=image.intrinsics / 2, sizes=image.sizes / 2)
     found = with_sensor(DepthPriors([packed(np.zeros((30, 40, 2)))]), [file], 0.002, half).image(0)
     u, v = (5.5 * 2 - 40) / 60, (3.5 * 2 - 30) / 60
     assert found[3, 5] == pytest.approx(np.array([1, SENSOR_ERROR]) / (6 * np.sqrt(u * u + v * v + 1)), rel=STEP)

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from mmpi_ns.ops import dispatch
 from mmpi_priors.ops.likeness import most_alike
 from mmpi_priors.ops.patches import others_of
 
 SHAPE, SHAPES = (13, 21), [(13, 21), (9, 30), (16, 8), (13, 21)]
 CLOSE = 0.01
 """Places and gray levels are rounded, single precision may round the other way."""
-
-
-@pytest.fixture(params=["torch", "native"], autouse=True)
-def form(request):
-    with dispatch.chosen(request.param):
-        yield
+pytestmark = pytest.mark.usefixtures("form")
 
 
 def texture(rng, shape):
@@ -92,21 +88,28 @@ class Oracle:
         return covariance / max(mine.std(), 1) / max(theirs.std(), 1)
 
 
-def expected(scene, q, least, most, pairs):
-    """Correlations of the three kinds at an inverse depth, -1 where it is of another kind, NaN: undecided. [3, H, W]"""
-    gray, *others = scene
-    result = np.full((3, *gray.shape), -1.0)
+@cache
+def correlations(count, seed, ahead, q):
+    """Of each other image at an inverse depth, pixel by pixel, and the images' marks there. [N, H, W] each"""
+    gray, *others = a_scene(count, seed, ahead)
     oracles = [Oracle(gray, *other, q) for other in zip(*others, strict=True)]
-    for r, c in np.ndindex(gray.shape):
-        each = [oracle.correlation(r, c) for oracle in oracles]
+    each = [[oracle.correlation(r, c) for r, c in np.ndindex(SHAPE)] for oracle in oracles]
+    return np.reshape(each, (count, *SHAPE)), np.array([oracle.marked for oracle in oracles])
+
+
+def expected(correlations, marks, q, least, most, pairs):
+    """Correlations of the three kinds at an inverse depth, -1 where it is of another kind, NaN: undecided. [3, H, W]"""
+    result = np.full((3, *SHAPE), -1.0)
+    for r, c in np.ndindex(SHAPE):
+        each = correlations[:, r, c].tolist()
         kind = 0 if least[r, c] <= q <= most else 1
         if np.isnan(each).any():
             result[:, r, c] = np.nan
         elif pairs:
             result[kind, r, c] = np.mean(sorted([-1, -1, *each])[-2:])
         else:
-            for oracle, one in zip(oracles, each, strict=True):
-                its = 2 if oracle.marked[r, c] else kind
+            for marked, one in zip(marks[:, r, c], each, strict=True):
+                its = 2 if marked else kind
                 result[its, r, c] = max(result[its, r, c], one)
     return result
 
@@ -129,7 +132,7 @@ def test_the_most_alike_depths_are_those_of_single_pixels(count, seed, ahead, pa
     alone = [asked(scene, depths[d : d + 1], least, 0.8, pairs)[0] for d in range(len(depths))]
     kinds = np.zeros(3)
     for q, alike in zip(depths, alone, strict=True):
-        truth = expected(scene, q, least, 0.8, pairs)
+        truth = expected(*correlations(count, seed, ahead, q), q, least, 0.8, pairs)
         decided = ~np.isnan(truth)
         assert decided.mean() > 0.6
         assert alike[decided] == pytest.approx(truth[decided], abs=CLOSE)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from hand_made import posed
 
-from mmpi_ns.data.posed_images import PosedImages
 from mmpi_priors.lone_depth import LEAST_ERROR, MOST_ERROR, continued, is_lone
 
 F32 = np.float32
@@ -77,21 +75,18 @@ def test_nothing_known_or_everything_known_adds_nothing():
     assert not continued(seen(plane((0, 0, -1), 5, d), np.ones((HEIGHT, WIDTH), bool)), d).any()
 
 
-def posed(*places, lens=(0.0, 0.0, 0.0, 0.0)):
+def ahead(*places):
     """Cameras that look along -z from these places."""
     poses = np.tile(np.eye(4)[:3], (len(places), 1, 1))
     poses[:, :, 3] = places
-    count = len(places)
-    intrinsics = np.tile([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], (count, 1))
-    sizes = np.tile([float(WIDTH), HEIGHT], (count, 1))
-    return PosedImages((Path(__file__),) * count, poses, intrinsics, sizes, np.tile(lens, (count, 1)).astype(float))  # type: ignore[arg-type]
+    return posed(poses, [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], [WIDTH, HEIGHT])
 
 
 def test_a_point_is_lone_that_at_most_one_other_image_shows():
     """The second camera stands further on: it sees the middle of what the first one sees, nothing behind itself."""
-    images = posed((0, 0, 0), (0, 0, -3), (0, 0, -3.5))
+    images = ahead((0, 0, 0), (0, 0, -3), (0, 0, -3.5))
     points = np.array([[0.0, 0, -10], [7.0, 0, -10], [0.0, 0, -2], [5.4, 0.0, -10]])
     assert is_lone(images, 0, points).tolist() == [False, True, True, True]  # borders: 0.8 (10 - 3), 0.8 (10 - 3.5)
     assert is_lone(images, 1, points[:1]).tolist() == [False]
-    assert is_lone(posed((0, 0, 0)), 0, points).tolist() == [True] * 4
+    assert is_lone(ahead((0, 0, 0)), 0, points).tolist() == [True] * 4
     assert is_lone(images, 0, np.zeros((0, 3))).shape == (0,)

@@ -2,37 +2,34 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from hand_made import observed, posed
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_ns.placement.observations import Observations
-from mmpi_priors.clouds import see_points
+from mmpi_priors.clouds import read_ply, see_points
 
-BACK = np.concatenate([np.diag([-1.0, 1, -1]), np.zeros((3, 1))], 1)
-SIZE = np.array([400.0, 300])
+PINHOLE, SIZE = [200, 200, 200, 150], [400, 300]
 
 
 def cameras(*poses, lens=(0.0, 0, 0, 0)) -> PosedImages:
-    count = len(poses)
-    return PosedImages(
-        files=tuple(Path(f"{i}.png") for i in range(count)),
-        camera_to_worlds=np.stack(poses),
-        intrinsics=np.tile([200.0, 200, 200, 150], (count, 1)),
-        sizes=np.tile(SIZE, (count, 1)),
-        distortion=np.tile(np.array(lens, float), (count, 1)),
-    )
+    return posed(poses, PINHOLE, SIZE, lens=lens)
 
 
 AHEAD = np.eye(4)[:3]
-BOTH = cameras(AHEAD, BACK)
+BOTH = cameras(AHEAD, AHEAD * [[-1], [1], [-1]])
 
 
 def wall(z, x0, x1, step=0.02):
     x, y = np.meshgrid(np.arange(x0, x1, step), np.arange(-0.5, 0.5, step))
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], -1)
+
+
+def test_points_keep_all_their_digits(tmp_path):
+    head = ["ply", "format ascii 1.0", "element vertex 2", *(f"property double {c}" for c in "xyz"), "end_header", ""]
+    path = tmp_path / "map.ply"
+    path.write_text("\n".join(head) + "455000.123456789 5411000.25 -1\n0 0 0\n")
+    np.testing.assert_array_equal(read_ply(path), [[455000.123456789, 5411000.25, -1], [0, 0, 0]])
 
 
 def test_a_wall_hides_what_lies_behind_it_and_not_what_lies_beside_it():
@@ -80,24 +77,13 @@ def test_a_point_that_the_cloud_would_hide_is_seen_where_matches_confirm_it():
     assert not np.isin(1 + np.arange(len(ground)), see_points(seen.points, cameras(AHEAD)).seen_point).all()
 
 
-def observations(points=0, tracked=0, searched=0) -> Observations:
-    return Observations(
-        camera_to_worlds=BOTH.camera_to_worlds,
-        intrinsics=BOTH.intrinsics,
-        sizes=BOTH.sizes,
-        points=np.full((points, 3), 9.0),
-        seen_by=np.zeros(tracked + searched, np.int64),
-        seen_point=np.arange(tracked + searched) % max(points, 1),
-        seen_at=np.full((tracked, 2), 5.0),
-        loose=np.zeros((1, 3)),
-    )
-
-
 def test_sightings_come_after_the_tracks_and_before_searched_points_without_contradicted_ones():
     points = np.array([[-0.5, 0, -1.0], [0.5, 0, -1], [0.6, 0.1, -1]])
     seen = see_points(points, cameras(AHEAD, AHEAD), flat_depth(3.0))
     assert seen.contradicted.tolist() == [2, 0, 0]
-    joined = seen.added_to(observations(points=4, tracked=2, searched=2))
+    poses, nothing = BOTH.camera_to_worlds, np.zeros((1, 3))
+    before = observed(poses, PINHOLE, SIZE, np.full((4, 3), 9.0), [0] * 4, seen_at=[[5, 5]] * 2, loose=nothing)
+    joined = seen.added_to(before)
     assert len(joined.points) == 7 and joined.loose is None
     assert joined.seen_point.tolist() == [0, 1, 5, 6, 5, 6, 2, 3]
     assert joined.seen_by.tolist() == [0, 0, 0, 0, 1, 1, 0, 0]

@@ -6,17 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from mmpi_ns.ops import dispatch
 from mmpi_priors.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
 
 ROWS, COLUMNS = 14, 37
 NOISE, FARTHEST, MOST_RELATIVE = 0.3, 1.0, 0.15
-
-
-@pytest.fixture(params=["torch", "native"], autouse=True)
-def form(request):
-    with dispatch.chosen(request.param):
-        yield
+pytestmark = pytest.mark.usefixtures("form")
 
 
 def two_cameras(seed):

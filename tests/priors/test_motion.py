@@ -8,16 +8,10 @@ import pytest
 import torch
 from scipy.ndimage import correlate, map_coordinates
 
-from mmpi_ns.ops import dispatch
 from mmpi_priors.ops.motion import find_motion, refine_motion
 
 SIDE, FLAT = 8, 16
-
-
-@pytest.fixture(params=["torch", "native"], autouse=True)
-def form(request):
-    with dispatch.chosen(request.param):
-        yield
+pytestmark = pytest.mark.usefixtures("form")
 
 
 def look(image, x, y):

@@ -1,4 +1,5 @@
-"""What moves on a short drive is masked, and nothing of it gives rays or depth; what stands still is kept."""
+"""What moves on a short drive is masked, and nothing of it gives rays or depth; what stands still is kept. Halos around
+what moves leave its mask, and what is missing of it joins."""
 
 from __future__ import annotations
 
@@ -12,13 +13,9 @@ from training_runs import datamanager
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_priors.dense import Depth
 from mmpi_priors.moving import gain_of, in_image
-from mmpi_priors.moving_evidence import Evidence, Neighbour, Shot, ground_of
-from mmpi_priors.moving_objects import (
-    LEAST_LEVELS,
-    REACH,
-    STEPS,
-    unexplained,
-)
+from mmpi_priors.moving_evidence import Neighbour, Shot, ground_of, least_unlike
+from mmpi_priors.moving_objects import LEAST_LEVELS, REACH, STEPS, unexplained
+from mmpi_priors.moving_outline import AROUND, outlined
 from mmpi_priors.views import Parallax, View, camera_matrix
 from mmpi_scene.catalogue import make_scene
 from mmpi_scene.dataset import write_dataset
@@ -86,18 +83,21 @@ def textured(seed, shape=SIZE, grain=1.5):
     return np.clip(128 + 200 * grain * cv2.GaussianBlur(random, (0, 0), grain), 0, 255).astype(np.uint8)
 
 
+def of_wall(shift) -> Shot:
+    """Of a textured wall at inverse depth 0.5."""
+    return a_shot(shift, np.ascontiguousarray(textured(0, (60, 120))[:, 10 + round(35 * shift) :][:, :80]), 0.5)
+
+
 def neighbours(shot, *others):
     return [Neighbour.of(shot, other) for other in others]
 
 
 def test_a_wall_is_explained_by_its_depth_and_another_picture_is_not():
-    wide = textured(0, (60, 120))
-    inverse = 0.5
-    shots = [a_shot(0.1 * k, np.ascontiguousarray(wide[:, 10 + round(3.5 * k) :][:, :80]), inverse) for k in (-2, 0, 2)]
+    shots = [of_wall(0.1 * k) for k in (-2, 0, 2)]
     middle = np.zeros(SIZE, bool)
     middle[20:40, 30:50] = True
     assert np.median(unexplained(shots[1], neighbours(shots[1], shots[0], shots[2]), middle)) < 12
-    strange = a_shot(0.0, textured(1), inverse)
+    strange = a_shot(0.0, textured(1), 0.5)
     assert np.median(unexplained(strange, neighbours(strange, shots[0], shots[2]), middle)) > 20
 
 
@@ -134,8 +134,7 @@ def test_levels_are_those_of_every_depth_or_fewer_than_a_seed_needs():
 
 
 def test_an_image_of_another_exposure_is_brought_to_that_of_the_shot():
-    wide = textured(0, (60, 120))
-    shot, other = (a_shot(0.1 * k, np.ascontiguousarray(wide[:, 10 + round(3.5 * k) :][:, :80]), 0.5) for k in (0, 2))
+    shot, other = of_wall(0.0), of_wall(0.2)
     darker = replace(other, color=np.rint(other.color * [0.5, 0.7, 0.8]).astype(np.uint8))
     np.testing.assert_allclose(gain_of(shot, darker), [2, 1 / 0.7, 1.25], rtol=0.05)
     np.testing.assert_allclose(Neighbour.of(shot, darker, gain_of(shot, darker)).color, other.color, atol=12)
@@ -152,14 +151,6 @@ def test_the_ground_is_found_and_a_wall_is_not_ground():
     assert ground_of(a_view(), Depth(wall, 0.01 * wall), up) is None
 
 
-def a_scene(color, horizon=None, judged=None):
-    nothing = np.zeros(SIZE, np.uint8)
-    judged = np.ones(SIZE, bool) if judged is None else judged
-    row = None if horizon is None else np.full(SIZE[1], float(horizon))
-    shot = Shot(a_view(), color, Depth(*np.zeros((2, *SIZE), np.float32)), None, row)
-    return shot, Evidence(nothing, nothing, nothing, judged, 0.0)
-
-
 def test_a_mask_of_a_straightened_view_lies_where_the_lens_shows_it():
     distortion = np.array([[-0.2, 0.0, 0.0, 0.0]])
     images = PosedImages((), np.eye(4)[None, :3], 2 * PINHOLE[None], np.array([[160.0, 120.0]]), distortion)
@@ -172,3 +163,57 @@ def test_a_mask_of_a_straightened_view_lies_where_the_lens_shows_it():
         np.dstack([corner, np.ones((1, 1))]), *np.zeros((2, 3)), camera_matrix(2 * PINHOLE), distortion[0]
     )
     np.testing.assert_allclose([x, y], bent[0].ravel(), atol=1.0)
+
+
+# Outlines -------------------------------------------------------------------------------------------------------------
+
+EVERYWHERE = np.s_[0 : SIZE[0], 0 : SIZE[1]]
+SQUARE, HALO = np.s_[22:38, 30:50], np.s_[16:44, 24:56]
+
+
+def in_box(box) -> np.ndarray:
+    mask = np.zeros(SIZE, bool)
+    mask[box] = True
+    return mask
+
+
+def a_scene():
+    """A wall with another picture in front of it in the middle image; its neighbours, in which nothing moves."""
+    before, shot, after = (of_wall(0.1 * k) for k in (-2, 0, 2))
+    shot.color[SQUARE] = textured(1)[SQUARE]
+    return shot, neighbours(shot, before, after)
+
+
+def outline(mask, core):
+    shot, others = a_scene()
+    return outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)
+
+
+def test_what_a_neighbour_explains_leaves_from_outside():
+    shown = outline(in_box(HALO), in_box(np.s_[30:34, 38:42]))
+    around = cv2.dilate(in_box(SQUARE).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    assert shown[SQUARE].mean() > 0.95 and not shown[~around].any()
+
+
+def test_what_no_neighbour_explains_joins():
+    shown = outline(in_box(np.s_[22:38, 30:41]), in_box(np.s_[30:34, 34:38]))
+    around = cv2.dilate(in_box(SQUARE).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    assert shown[SQUARE].mean() > 0.95 and not shown[~around].any()
+
+
+def test_another_thing_that_nothing_explains_does_not_join():
+    shot, others = a_scene()
+    for box in (np.s_[47:55, 32:48], np.s_[26:34, 50:78]):  # one beside it, one that it touches
+        shot.color[box] = textured(2)[box]
+    mask, core = in_box(SQUARE), in_box(np.s_[30:34, 38:42])
+    shown = outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)
+    assert not shown[48:].any() and shown[26:34, 50:56].mean() > 0.8 and not shown[:, 50 + AROUND + 2 :].any()
+
+
+def test_what_moves_in_a_neighbour_explains_nothing():
+    shot, others = a_scene()
+    nothing, everything = np.zeros(SIZE, bool), np.ones(SIZE, bool)
+    both = least_unlike(shot, others, [nothing, nothing], EVERYWHERE)
+    assert np.median(both[5:15, 20:60]) < 4 and np.median(both[26:34, 34:46]) > 12
+    one = least_unlike(shot, others, [nothing, everything], EVERYWHERE)
+    assert (one >= both).all() and (least_unlike(shot, others, [everything] * 2, EVERYWHERE) == 255).all()

@@ -15,8 +15,6 @@ from mmpi_priors.views import View
 
 SIZE, FOCAL, HEIGHT, STEP = (120, 200), 200.0, 1.5, 1.0
 """Rows and columns, pixels, metres of the cameras over the ground and between them."""
-TURNS = (0.0, 0.14, 0.28)
-"""Radians to the right by which the cameras are turned: 28 pixels between two."""
 
 
 def texture(seed: int, shape: tuple[int, int], grain: float) -> np.ndarray:
@@ -50,9 +48,10 @@ def a_shot(turn: float, step: float, person: tuple[float, float]) -> tuple[Shot,
     return Shot(view, color, Depth(ground, 0.01 * ground), ground), shown
 
 
-def seen(places, masked, turns=TURNS):
+def seen(places, masked):
     """What is followed to three images from those that are masked, and the truth."""
-    pairs = [a_shot(turn, k * STEP, place) for k, (turn, place) in enumerate(zip(turns, places, strict=True))]
+    # Turned by 28 pixels between two.
+    pairs = [a_shot(0.14 * k, k * STEP, place) for k, place in enumerate(places)]
     truth = [shown for _, shown in pairs]
     masks = [t if k in masked else np.zeros(SIZE, bool) for k, t in enumerate(truth)]
     with ThreadPoolExecutor(1) as pool:
@@ -60,17 +59,13 @@ def seen(places, masked, turns=TURNS):
     return parts, truth
 
 
-AHEAD = [(0.3, 6.0), (0.3, 7.0), (0.3, 8.0)]
-STANDS = [(0.3, 8.0)] * 3
-
-
 @pytest.mark.parametrize("hidden", [0, 1])
 def test_somebody_ahead_is_followed_to_an_image_that_is_turned(hidden):
-    parts, truth = seen(AHEAD, {0, 1, 2} - {hidden})
+    parts, truth = seen([(0.3, 6.0), (0.3, 7.0), (0.3, 8.0)], {0, 1, 2} - {hidden})
     around = cv2.dilate(truth[hidden].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # a pixel at half the size
     assert parts[hidden][truth[hidden]].mean() > 0.65 and not parts[hidden][~around].any()
 
 
 def test_somebody_who_stands_is_not_followed():
-    parts, _ = seen(STANDS, {0, 1})
+    parts, _ = seen([(0.3, 8.0)] * 3, {0, 1})
     assert not any(part.any() for part in parts)

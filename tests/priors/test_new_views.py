@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from hand_made import posed
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from tiny_scene import FOCAL, HEIGHT, TRAIN, WALL, WIDTH, color_of, image_of, on_wall, pixel_rays, pose_of
 
-from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.data.priors import DepthPriors, packed
 from mmpi_priors import new_views
 from mmpi_priors.new_views import find_shared_points
@@ -64,19 +64,15 @@ class Images:
         return {"image": image} | ({} if self.mask is None else {"mask": torch.from_numpy(self.mask)[..., None]})
 
 
-def posed(poses=POSES, distortion=(0.0, 0.0, 0.0, 0.0), fisheye=False):
-    count = len(poses)
-    camera = np.tile([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], (count, 1))
-    size = np.tile([float(WIDTH), HEIGHT], (count, 1))
-    return PosedImages((), poses, camera, size, np.tile(distortion, (count, 1)).astype(float), fisheye)
+CAMERA = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], [WIDTH, HEIGHT]
 
 
-def find(known=None, images=(0, 1, 2, 3, 4, 5), dataset=None):
-    return find_shared_points(dataset or Images(), posed(), known or exact_depths(), rays_of, images, 0)
+def find(known=None, dataset=None):
+    return find_shared_points(dataset or Images(), posed(POSES, *CAMERA), known or exact_depths(), rays_of, range(6), 0)
 
 
-def drawn(points, count=2000, seed=0):
-    bundle, colors, depths = points.draw(count, rays_of, torch.Generator().manual_seed(seed))
+def drawn(points):
+    bundle, colors, depths = points.draw(2000, rays_of, torch.Generator().manual_seed(0))
     return bundle.origins.double().numpy(), bundle.directions.double().numpy(), colors.numpy(), depths.double().numpy()
 
 
@@ -149,13 +145,14 @@ def test_projection_is_the_inverse_of_nerfstudios_rays(lens, kind):
     )  # fmt: skip
     indices = torch.tensor([[j, r, c] for j in range(3) for r in range(0, HEIGHT, 5) for c in range(0, WIDTH, 7)])
     rays = cameras.generate_rays(indices[:, :1], coords=indices[:, 1:] + 0.5)
+    images = posed(POSES, *CAMERA, lens=lens, fisheye=kind == "FISHEYE")
     for j in range(3):
         own = indices[:, 0] == j
         ends = (rays.origins + 3.7 * rays.directions)[own].double().numpy()
-        at = project(posed(distortion=lens, fisheye=kind == "FISHEYE"), j, ends)
+        at = project(images, j, ends)
         assert np.abs(at - (indices[own][:, 1:].flip(-1) + 0.5).numpy()).max() < 2e-3
     behind = (rays.origins - 3.7 * rays.directions)[:4].double().numpy()
-    assert (project(posed(distortion=lens, fisheye=kind == "FISHEYE"), 0, behind) == -1e4).all()
+    assert (project(images, 0, behind) == -1e4).all()
 
 
 def test_a_point_of_another_colour_in_the_other_image_is_no_point():

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
 
-from mmpi_ns.ops import dispatch
 from mmpi_priors.ops.patches import Patches, compare_planes, others_of, spread_planes
 
 HEIGHT, WIDTH, STRIDE, ALONE = 18, 37, 2, 0.1
 PINHOLE = np.array([40.0, 44.0, 17.0, 8.0])
-
-
-@pytest.fixture(params=["torch", "native"], autouse=True)
-def form(request):
-    with dispatch.chosen(request.param):
-        yield
+pytestmark = pytest.mark.usefixtures("form")
 
 
 def texture(x, y):
@@ -126,18 +122,23 @@ def nothing(planes):
     return Patches(planes, torch.full(planes.shape[:2], -1.0))
 
 
-@pytest.mark.parametrize(("count", "seed"), [(1, 0), (3, 1), (4, 2)])
-def test_planes_are_as_alike_as_single_pixels_say(count, seed):
+@cache
+def random_planes(count, seed):
+    """A scene, planes of its pixels, and how alike these are by the oracle."""
     scene = random_scene(count, seed)
-    rng = np.random.default_rng(seed)
-    planes = rng.normal(size=(HEIGHT, WIDTH, 3)) * [0.3, 0.02, 0.02] + [0.35, 0, 0]
+    planes = np.random.default_rng(seed).normal(size=(HEIGHT, WIDTH, 3)) * [0.3, 0.02, 0.02] + [0.35, 0, 0]
     planes[0, :, 0] = np.linspace(-1, 40, WIDTH)
     planes = np.float32(planes)
+    return scene, planes, {at: alike(*scene, *at, planes[at].astype(float)) for at in np.ndindex(HEIGHT, WIDTH)}
+
+
+@pytest.mark.parametrize(("count", "seed"), [(1, 0), (3, 1), (4, 2)])
+def test_planes_are_as_alike_as_single_pixels_say(count, seed):
+    scene, planes, by_pixels = random_planes(count, seed)
     gray, others = operands(*scene)
     patches = compare_planes(gray, nothing(torch.zeros(HEIGHT, WIDTH, 3)), torch.from_numpy(planes), others, STRIDE)
     checked, compared = 0, 0
-    for r, c in np.ndindex(HEIGHT, WIDTH):
-        expected = alike(*scene, r, c, planes[r, c].astype(float))
+    for (r, c), expected in by_pixels.items():
         if np.isnan(expected):
             continue
         checked += 1

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hand_made import posed
 from PIL import Image
+from tiny_scene import undistort
 from value_noise import noise
 
-from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors.observe import with_tracks
 from mmpi_priors.tracks import triangulate
@@ -21,18 +22,6 @@ LENS = (0.05, -0.02, 0.001, -0.002)
 def pose_at(x, turn=0.0):
     c, s = np.cos(turn), np.sin(turn)
     return np.array([[c, 0, s, x], [0, 1, 0, 0.03 * x], [-s, 0, c, 0.1 * x]])
-
-
-def undistort(x, y, lens):
-    """Directions whose OpenCV distortion falls on (x, y), by fixed-point iteration."""
-    k1, k2, p1, p2 = lens
-    u, v = x.copy(), y.copy()
-    for _ in range(30):
-        r2 = u * u + v * v
-        radial = 1 + k1 * r2 + k2 * r2 * r2
-        u = (x - 2 * p1 * u * v - p2 * (r2 + 2 * u * u)) / radial
-        v = (y - p1 * (r2 + 2 * v * v) - 2 * p2 * u * v) / radial
-    return u, v
 
 
 def texture(x, y, seed):
@@ -72,15 +61,7 @@ def scene_of(folder, poses, lens=(0.0, 0.0, 0.0, 0.0), fisheye=False, contrast=1
         files.append(folder / f"view{i}.png")
         gray = 0.5 + contrast * (picture(pose, lens, fisheye) - 0.5)
         Image.fromarray((gray * 255).round().astype(np.uint8)).save(files[-1])
-    count = len(poses)
-    return PosedImages(
-        files=tuple(files),
-        camera_to_worlds=np.stack(poses),
-        intrinsics=np.tile([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], (count, 1)),
-        sizes=np.tile([float(WIDTH), HEIGHT], (count, 1)),
-        distortion=np.tile(lens, (count, 1)),
-        fisheye=fisheye,
-    )
+    return posed(poses, [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], [WIDTH, HEIGHT], files, lens, fisheye)
 
 
 POSES = [pose_at(0.12 * i, 0.02 * i) for i in range(5)]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from hand_made import posed
 from test_tracks import HEIGHT, LENS, POSES, WIDTH, scene_of
 
-from mmpi_ns.data.posed_images import PosedImages
 from mmpi_priors.views import Parallax, View, load_view
 
 
@@ -15,13 +15,11 @@ from mmpi_priors.views import Parallax, View, load_view
 def test_the_longer_side_of_a_working_view_is_limited(tmp_path, size):
     """An upright photo has no more pixels than the same across; the pinhole follows each side."""
     cv2.imwrite(str(tmp_path / "photo.png"), np.zeros(size[::-1], np.uint8))
-    pinhole = np.array([[800.0, 900.0, 480.0, 260.0]])
-    images = PosedImages(
-        (tmp_path / "photo.png",), np.stack(POSES[:1]), pinhole, np.array([size], float), np.zeros((1, 4)), False
-    )
+    pinhole = np.array([800.0, 900.0, 480.0, 260.0])
+    images = posed(POSES[:1], pinhole, size, [tmp_path / "photo.png"])
     view = load_view(images, 0, 200)
     assert view.gray.shape[::-1] == (size[0] // 5, size[1] // 5)
-    assert view.pinhole == pytest.approx(pinhole[0] / 5)
+    assert view.pinhole == pytest.approx(pinhole / 5)
     assert load_view(images, 0, 1000).gray.shape[::-1] == size
 
 

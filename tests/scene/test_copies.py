@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from bricked import big_plan, bricked_field, chance
 from random_fields import bundle, compare, random_rays, render
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import RELEASED_DENSITY
-from mmpi_ns.ops import dispatch
 from mmpi_ns.scene.bricks import tiles_with_copies
 from mmpi_ns.scene.texels import BRICK
 
@@ -72,9 +70,7 @@ def test_copies_of_everything_change_no_image():
     assert torch.equal(field.planned_heads(torch.arange(7)), torch.tensor([0, 1, 2, 0, 1, 2, 3]))
 
 
-@pytest.mark.parametrize("route", ["torch", "native"])
-def test_rays_through_copies_look_as_the_oracle_says(monkeypatch, route):
-    monkeypatch.setattr(dispatch, "_chosen", route)
+def test_rays_through_copies_look_as_the_oracle_says(form):
     field = bricked_field()
     field.copy_finely(some_tiles(field, 0.5))
     assert compare(field, *random_rays(field.plan, 12, seed=5), blends=False) >= 8

@@ -1,27 +1,15 @@
-"""MPI frames: which planes a ray meets, and where (geometry.py)."""
+"""MPI frames and the cube: which planes and samples a ray meets, and where (geometry.py)."""
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-import oracle
 import pytest
 import torch
-from hand_made import (
-    make_mpi,
-    random_mpi,
-    rays,
-    samples_to_ndc,
-    world_to_ndc,
-)
+from hand_made import make_mpi, rays, world_to_ndc
 
-from mmpi_ns.scene.geometry import (
-    Frames,
-    inverse_distance,
-    plane_hits,
-    sample_disparity,
-)
+from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, inverse_distance, plane_hits, sample_disparity
+from mmpi_ns.scene.plan import CubePlan
 
 F64 = torch.float64
 
@@ -135,52 +123,6 @@ def test_points_behind_an_mpi_are_outside_it_and_finite():
     assert not inside.any() and torch.isfinite(ndc).all()
 
 
-# Against the oracle --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("deep", [math.inf, 5.0])
-@pytest.mark.parametrize("num_mpis", [1, 12])
-def test_hits_of_many_mpis_equal_the_oracle(num_mpis, deep):
-    rng = np.random.default_rng(num_mpis)
-    plans = [random_mpi(rng, deep=deep) for _ in range(num_mpis)]
-    ray = rays(rng.normal(size=(60, 3)) * 2, rng.normal(size=(60, 3)), near=0.1)
-    frames = Frames.pack(plans, dtype=F64)
-    hits = plane_hits(*ray, frames)
-    found = 0
-    for k, mpi in enumerate(plans):
-        r, m, u, v, inverse_t = hit_samples(frames, hits, k)
-        each = [oracle.crossings(mpi, ray[0][i], ray[1][i], near=0.1) for i in range(60)]
-        live = np.array([c.live for c in each])
-        assert np.array_equal(np.stack([r, mpi.planes - 1 - m], -1), np.argwhere(live))
-        for values, name in ((u, "u"), (v, "v"), (inverse_t, "inverse_t")):
-            wanted = np.array([getattr(c, name) for c in each])[live]
-            assert np.allclose(values, wanted, rtol=1e-9, atol=1e-11), name
-        found += live.sum()
-    assert found > 30 * num_mpis
-
-
-def test_ndc_of_samples_equals_the_oracle_in_every_mpi():
-    rng = np.random.default_rng(8)
-    plans = [random_mpi(rng, deep=deep) for deep in (math.inf, math.inf, 8.0, 2.0, 30.0)]
-    origins, dirs, *_ = rays(rng.normal(size=(200, 3)), rng.normal(size=(200, 3)))
-    inverse_t = torch.tensor(rng.uniform(0.01, 2, size=200), dtype=F64)
-    inverse_t[::7] = 0
-    ndc, inside = samples_to_ndc(origins, dirs, inverse_t, Frames.pack(plans, dtype=F64))
-    short, _ = samples_to_ndc(origins.float(), dirs.float(), inverse_t.float(), Frames.pack(plans, dtype=torch.float32))
-    homogeneous, _ = world_to_ndc(origins * inverse_t[:, None] + dirs, inverse_t, Frames.pack(plans, dtype=F64))
-    for i in range(200):
-        for k, mpi in enumerate(plans):
-            place = oracle.place_in(mpi, origins[i], dirs[i], float(inverse_t[i]))
-            assert bool(inside[i, k]) == (place is not None and bool((np.abs(place[0]) <= 1).all()))
-            if place is not None:
-                wanted, _ = place
-                assert np.allclose(ndc[i, k], wanted, rtol=1e-9, atol=1e-9)
-                assert np.allclose(homogeneous[i, k], wanted, rtol=1e-9, atol=1e-9)
-            if inside[i, k]:
-                assert np.abs(short[i, k].numpy() - wanted).max() < 2e-5
-    assert 20 < inside.sum() < 900
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_plane_exactly_at_near_or_far_is_kept(dtype):
     """Division finds the range only to one plane; whether a plane at the border is in it, its own distance decides."""
@@ -195,3 +137,35 @@ def test_plane_exactly_at_near_or_far_is_kept(dtype):
         assert torch.equal(last[:, 0], torch.arange(1, planes) + (~kept).long())
         from_near = plane_hits(o, d, distance, infinite, frames)
         assert torch.equal(from_near.m_first[:, 0], torch.arange(1, planes) - (w * distance[:, 0] > 1).long())
+
+
+# The cube ------------------------------------------------------------------------------------------------------------
+
+BOX = CubePlan((-1.0, -2.0, -1.0), (1.0, 2.0, 3.0), (9, 9, 5))
+
+
+def test_cube_step_is_the_shortest_voxel_side_over_the_samples_per_voxel():
+    # Voxel sides: x 2/4, y 4/8, z 4/8.
+    assert Cube.pack(BOX, 1.0).step == 0.5
+    assert Cube.pack(CubePlan((0.0, 0.0, 0.0), (1.0, 2.0, 4.0), (3, 3, 3)), 2.0).step == 0.25
+    corners = Cube.pack(BOX, 1.0, dtype=F64).normalised(
+        torch.tensor([BOX.lower, BOX.upper, (0.0, 0.0, 1.0)], dtype=F64)
+    )
+    assert corners.tolist() == [[-1] * 3, [1] * 3, [0] * 3]
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "near", "far", "expected"),
+    [
+        ([0, 0, 0], [1, 0, 0], 0, math.inf, [0, 1]),  # from inside: t = 0.25, 0.75
+        ([-3, 0, 0], [1, 0, 0], 0, math.inf, [4, 5, 6, 7]),
+        ([-3, 0, 0], [1, 0, 0], 2.3, 3.3, [5, 6]),
+        ([-3, 0, 0], [-1, 0, 0], 0, math.inf, []),  # behind
+        ([-3, 2.5, 0], [1, 0, 0], 0, math.inf, []),  # parallel, outside the slab
+        ([-3, 2.0, 0], [1, 0, 0], 0, math.inf, [4, 5, 6, 7]),  # parallel, on the slab
+        ([-3, 0, 0], [0, 1, 0], 0, math.inf, []),
+    ],
+)
+def test_cube_hits_of_hand_made_rays(origin, direction, near, far, expected):
+    first, count = cube_hits(*rays(origin, direction, near, far), Cube.pack(BOX, 1.0, dtype=F64))
+    assert [int(first) + i for i in range(int(count))] == expected

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import oracle
 import pytest
 import torch
 
@@ -38,26 +37,6 @@ def test_heads_own_consecutive_tiles_with_the_cube_last_and_every_texel_a_row(pl
     rows = torch.cat([g.rows for g in grids])
     assert len(rows.unique()) == len(rows) == plan.scaled(9).texels and rows.min() >= BRICK
     assert rows.max() < len(grids[0].places) * BRICK == (108 + 60 + 1) * BRICK
-
-
-def test_bilinear_lookup_equals_the_loop_on_every_plane_of_every_mpi(plan, table):
-    uv = positions(90, 2)
-    plane = torch.arange(90) % 9
-    for grid in head_grids(plan)[:-1]:
-        rows, weights = grid.bilinear(plane, uv)
-        found = interpolate_densely(table, rows, weights)
-        for i in range(90):
-            wanted = oracle.lookup(block(table, grid)[i % 9], uv[i])
-            assert np.allclose(found[i], wanted, rtol=1e-12, atol=1e-12)
-
-
-def test_trilinear_lookup_equals_the_loop_in_every_head(plan, table):
-    ndc = positions(90, 3)
-    for grid in head_grids(plan):
-        found = interpolate_densely(table, *grid.trilinear(ndc))
-        for i in range(90):
-            wanted = oracle.lookup(block(table, grid), ndc[i])
-            assert np.allclose(found[i], wanted, rtol=1e-12, atol=1e-12)
 
 
 def test_nearest_texel_is_the_one_with_the_largest_weight(plan):

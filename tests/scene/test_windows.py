@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hand_made import make_mpi
-from long_road import road
+from hand_made import make_mpi, observed
 from training_runs import datamanager, schedule_of
 
 from mmpi_ns.placement.defaults import FEW, MANY, RAYS, rays_times, steps_for
+from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.split import find_balls, most_pixels, of_cameras, place_windows
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
@@ -21,6 +21,22 @@ from mmpi_ns.settings import PlacementConfig, ScheduleConfig
 from mmpi_ns.training.phases import make_schedule
 
 # Splitting -----------------------------------------------------------------------------------------------------------
+
+
+def road(length: float, spacing: float = 1.0) -> Observations:
+    """Cameras that drive along a slow bend and see walls 6 away on both sides, some way ahead."""
+    s = np.arange(0, length, spacing)
+    centers = np.stack([s, 0 * s, 8 * np.sin(s / 60)], -1)
+    heading = np.stack([np.ones_like(s), 0 * s, 8 / 60 * np.cos(s / 60)], -1)
+    facing = heading / np.linalg.norm(heading, axis=-1, keepdims=True)
+    up = np.array([0.0, 1.0, 0.0])
+    right = np.cross(facing, up)
+    poses = np.stack([right, np.broadcast_to(up, right.shape), -facing, centers], -1)
+    rng = np.random.default_rng(0)
+    ahead, side = rng.uniform(4, 20, (len(s), 30)), rng.choice([-6.0, 6.0], (len(s), 30))
+    points = centers[:, None] + ahead[..., None] * facing[:, None] + side[..., None] * right[:, None]
+    points = points + rng.uniform(-2, 2, (len(s), 30))[..., None] * up
+    return observed(poses, [100, 100, 80, 40], [160, 80], points, np.repeat(np.arange(len(s)), 30))
 
 
 def test_a_short_capture_is_one_window_and_its_plan_is_written_as_before():
@@ -89,6 +105,16 @@ def test_some_cameras_observations_are_those_of_the_whole():
         np.testing.assert_array_equal(
             np.sort(part.seen_point[part.seen_by == new]), np.sort(seen.seen_point[seen.seen_by == old])
         )
+
+
+def test_mpis_a_ray_can_meet_do_not_grow_with_the_road():
+    """All of a ray's MPIs are those of its windows; twice the road has twice the windows."""
+    config = PlacementConfig(max_texels=2e6, max_planes=32)
+    short, long = (place_windows(road(length, 4.0), config) for length in (220, 440))
+    most, total = ([f(len(p.mpis) for p in plan.plans) for plan in (short, long)] for f in (max, sum))
+    assert len(long) >= 1.6 * len(short) >= 4
+    assert 1.6 * total[0] <= total[1] <= 2.5 * total[0]
+    assert most[1] <= 1.25 * most[0] + 1
 
 
 # Shares --------------------------------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from stability.cases import (
     Precision,
     compare,
     float32,
-    plan_of,
     random_mpi,
     single,
     tried,
@@ -27,6 +26,7 @@ from mmpi_ns.blending import blend_shares, blended_optical_depth
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import composite
 from mmpi_ns.ops.composite import median_inverse_distance, render_colors
+from mmpi_ns.scene.plan import ScenePlan
 
 composite_weights = composite.composite_weights.reference
 
@@ -40,7 +40,7 @@ LONG = 10_000
 def _layout(planes: int) -> Any:
     """Of a field of one MPI."""
     mpi = random_mpi(np.random.default_rng(0), planes)
-    return MMPIField(plan_of([mpi]), feature_channels=3, hidden_width=4).layout
+    return MMPIField(ScenePlan((mpi,), None, 0.05, 1.0), feature_channels=3, hidden_width=4).layout
 
 
 def _density(raw: Array, planes: int, precision: Precision) -> Outcome:

@@ -9,12 +9,13 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import hand_made
 import numpy as np
 import torch
 from random_scenes import Array
 from torch import Tensor
 
-from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import MPIPlan
 
 UNIT = 2.0**-24
 """Unit roundoff of float32: the largest relative error of one rounding."""
@@ -27,8 +28,6 @@ class Precision:
     """Under which arithmetic a case runs."""
 
     name: str
-    network_unit: float
-    """Unit roundoff inside the colour networks, the one part that may run in reduced precision."""
     dtype: torch.dtype | None = None
     """Of autocast; None: off."""
 
@@ -36,7 +35,7 @@ class Precision:
         return contextlib.nullcontext() if self.dtype is None else torch.autocast("cpu", self.dtype)
 
 
-PRECISIONS = (Precision("float32", UNIT), Precision("bfloat16 autocast", 2.0**-9, torch.bfloat16))
+PRECISIONS = (Precision("float32"), Precision("bfloat16 autocast", torch.bfloat16))
 
 
 @dataclass(frozen=True)
@@ -151,24 +150,9 @@ def snap(mpi: MPIPlan) -> MPIPlan:
     return replace(mpi, **{name: _plain(getattr(mpi, name)) for name in ("origin", "axes", "near", "far", "extent")})
 
 
-def rotation(rng: np.random.Generator) -> Array:
-    """A random right-handed frame, rows are axes."""
-    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q if np.linalg.det(q) > 0 else -q
-
-
-def random_mpi(rng: np.random.Generator, planes: int = 12, axes: Any = None, **changes: Any) -> MPIPlan:
+def random_mpi(rng: np.random.Generator, planes: int = 12, **changes: Any) -> MPIPlan:
     """An MPI within a few units of the world's origin, with an asymmetric frustum."""
-    (u, v), (across, down) = -rng.uniform(0.1, 2, 2), rng.uniform(0.5, 4, 2)
-    frame = rotation(rng) if axes is None else axes
-    origin, near = _plain(rng.normal(size=3) * 2), float(rng.uniform(0.5, 4))
-    mpi = MPIPlan("random", origin, _plain(frame), near, (u, u + across, v, v + down), planes, 5, 7)
-    return snap(replace(mpi, **changes))
-
-
-def plan_of(mpis: list[MPIPlan], cube: CubePlan | None = None, ray_near: float = 0.05) -> ScenePlan:
-    named = tuple(replace(m, name=f"mpi{k}") for k, m in enumerate(mpis))
-    return ScenePlan(named, cube, float(single(ray_near)), 1.0)
+    return snap(replace(hand_made.random_mpi(rng, planes=planes), **changes))
 
 
 def rays_at(rng: np.random.Generator, mpis: list[MPIPlan], count: int, spread: float = 0.6) -> tuple[Array, Array]:

@@ -1,8 +1,10 @@
-"""What is said of a run before it starts: the memory that it takes (memory.py)."""
+"""What is said of a run: before it starts the memory that it takes (memory.py), and at its end how to go on."""
 
 from __future__ import annotations
 
 import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from training_runs import datamanager, load, ready, trainer_config
 
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
-from mmpi_ns.training import memory
+from mmpi_ns.training import memory, report
 from mmpi_ns.training.memory import Work, describe, fit_memory, reserved_bytes, training_bytes
 from mmpi_ns.training.run import views_of
 from mmpi_ns.utils.errors import InputError
@@ -123,3 +125,10 @@ def test_where_hardly_any_texel_fits_a_run_is_refused(free, stubborn):
     with pytest.raises(InputError, match="GiB are free"):
         fit_memory(plan, lambda _: None, WORK, GPU, lambda most: asked.append(most) or plan)
     assert len(asked) == (memory.ATTEMPTS - 1 if stubborn else 0)
+
+
+def test_the_next_commands_can_be_copied_from_any_folder():
+    _, *commands = report.next_commands(Path("/my photos/r")).splitlines()
+    assert [shlex.split(line)[shlex.split(line).index("--load-config") + 1] for line in commands] == [
+        "/my photos/r/config.yml"
+    ] * 3

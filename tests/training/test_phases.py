@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from training_runs import schedule_of
 
-from mmpi_ns.config import mmpi_kitti, mmpi_scannet, mmpi_scannet_short
+from mmpi_ns.config import mmpi, mmpi_kitti, mmpi_scannet, mmpi_scannet_short
 from mmpi_ns.training.phases import TRAINS, Phase, Schedule
 
 KINDS = ("density", "features", "colour", "reliability", "camera_opt")
@@ -91,23 +91,20 @@ def test_impossible_schedules_name_the_setting(settings, word):
 
 
 @pytest.mark.parametrize("method", [mmpi_kitti, mmpi_scannet, mmpi_scannet_short])
-def test_the_papers_methods_keep_its_rates(method):
+def test_the_papers_methods_keep_its_settings(method):
     model, optimizers = method.config.pipeline.model, method.config.optimizers
     assert (model.schedule.decay_decades, model.schedule.decay_from) == (1.5, 0.0)
-    assert model.colour.feature_channels == 9
-    assert optimizers["colour"]["optimizer"].lr == 1e-3
+    assert model.colour.feature_channels == 9 and optimizers["colour"]["optimizer"].lr == 1e-3
+    assert (model.loss.tv_density, model.loss.tv_features) == (1e-5, 1e-6)
+    assert mmpi.config.pipeline.model.loss.tv_density == 1e-4, "a change of one must not reach another"
+    if method is mmpi_kitti:
+        assert (model.schedule.training, model.schedule.rays_per_mpi) == ("two-phase", "split")
+        assert (model.schedule.blend_share, model.schedule.finetune_share) == (0.25, 0.0)
 
 
 @pytest.mark.parametrize(
     ("step", "name"),
-    [
-        (0, "individual"),
-        (29_999, "individual"),
-        (30_000, "blend"),
-        (39_999, "blend"),
-        (40_000, "blend"),
-        (10**9, "blend"),
-    ],
+    [(0, "individual"), (29_999, "individual"), *((s, "blend") for s in (30_000, 39_999, 40_000, 10**9))],
 )
 def test_a_phase_ends_just_before_the_next_begins(step, name):
     assert two_phase().phase_at(step).name == name

@@ -4,18 +4,10 @@ from __future__ import annotations
 
 from threading import Thread
 
-import pytest
 import torch
 
 from mmpi_ns.ops import build
 from mmpi_ns.utils import parallel
-
-
-@pytest.fixture
-def three_threads():
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(1)
 
 
 def test_torch_takes_one_thread_and_kernels_all(three_threads):
