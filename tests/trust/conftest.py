@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import shutil
+from functools import partial
 
 import pytest
-from tiny_scene import write_scene
+import tiny_scene
 
 
 @pytest.fixture(scope="session")
 def whole_scene(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("whole") / "tiny")
+    return tiny_scene.write_scene(tmp_path_factory.mktemp("whole") / "tiny")
 
 
 @pytest.fixture
@@ -24,9 +24,4 @@ def data(whole_scene, tmp_path):
 def edit(data):
     """Changes the contents of transforms.json."""
 
-    def change(how):
-        meta = json.loads((data / "transforms.json").read_text())
-        how(meta)
-        (data / "transforms.json").write_text(json.dumps(meta))
-
-    return change
+    return partial(tiny_scene.edit, data)

@@ -1,4 +1,4 @@
-"""Captures that cannot be used: ns-train ends with one sentence that names file, frame and remedy (docs/errors.md)."""
+"""Captures that cannot be used: ns-train ends with one sentence that names file, frame and remedy."""
 
 from __future__ import annotations
 
@@ -13,30 +13,22 @@ NAN, INF = math.nan, math.inf
 NAME = name_of(3)
 
 
+def file(frame=None, **changes):
+    """Sets fields of the whole file, or of one of its frames; ... removes one."""
+
+    def change(meta):
+        target = meta if frame is None else meta["frames"][frame]
+        for key, value in changes.items():
+            if value is ...:
+                del target[key]
+            else:
+                target[key] = value
+
+    return change
+
+
 def frame(**changes):
-    """Sets fields of the fourth frame; ... removes one."""
-
-    def change(meta):
-        for key, value in changes.items():
-            if value is ...:
-                del meta["frames"][3][key]
-            else:
-                meta["frames"][3][key] = value
-
-    return change
-
-
-def file(**changes):
-    """Sets fields of the whole file; ... removes one."""
-
-    def change(meta):
-        for key, value in changes.items():
-            if value is ...:
-                del meta[key]
-            else:
-                meta[key] = value
-
-    return change
+    return file(frame=3, **changes)
 
 
 def pose(how):
@@ -189,10 +181,7 @@ def test_test_images_that_are_trained_on_are_told(data, edit, tmp_path):
 # mmpi-plan -----------------------------------------------------------------------------------------------------------
 
 
-JUDGED = ("pose is singular", "w is text")
-
-
-@pytest.mark.parametrize("case", JUDGED)
+@pytest.mark.parametrize("case", ["pose is singular", "w is text"])
 def test_mmpi_plan_refuses_what_ns_train_refuses(data, edit, tmp_path, case):
     change, words = REFUSED[case]
     edit(change)

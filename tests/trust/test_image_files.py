@@ -1,4 +1,4 @@
-"""Image files that cannot be used, or are of another kind: ns-train names the file and the remedy (docs/errors.md)."""
+"""Image files that cannot be used, or are of another kind: ns-train names the file and the remedy."""
 
 from __future__ import annotations
 
@@ -11,41 +11,28 @@ from PIL import Image
 from tiny_scene import HEIGHT, WIDTH, name_of
 
 
-def save(data, i, pixels, **how):
-    Image.fromarray(pixels, **how).save(data / "images" / name_of(i))
-
-
 def smooth(channels):
     return np.broadcast_to(np.linspace(0, 255, WIDTH)[None, :, None], (HEIGHT, WIDTH, channels)).astype(np.uint8)
 
 
-def one_rgba(data):
-    save(data, 3, smooth(4))
+ODD = {
+    "transparent": lambda: Image.fromarray(smooth(4)),
+    "a palette": lambda: Image.fromarray(smooth(3)).convert("P"),
+    "16 bits": lambda: Image.fromarray(np.full((HEIGHT, WIDTH), 40_000, np.uint16)),
+}
 
 
-def one_palette(data):
-    Image.fromarray(smooth(3)).convert("P").save(data / "images" / name_of(3))
-
-
-def sixteen_bits(data):
-    save(data, 3, np.full((HEIGHT, WIDTH), 40_000, np.uint16))
-
-
-@pytest.mark.parametrize("odd", [one_rgba, one_palette, sixteen_bits])
-def test_images_of_other_kinds_among_rgb_train(data, tmp_path, odd):
-    odd(data)
+@pytest.mark.parametrize("kind", ODD)
+def test_images_of_other_kinds_among_rgb_train(data, tmp_path, kind):
+    ODD[kind]().save(data / "images" / name_of(3))
     assert "Training finished" in train(data, tmp_path).shown
-
-
-def float_image(path):
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.float32)).save(path, format="TIFF")
 
 
 DAMAGED = {
     "missing": lambda p: p.unlink(),
     "cut short": lambda p: p.write_bytes(p.read_bytes()[:300]),
     "no image": lambda p: p.write_bytes(b"hello"),
-    "of floats": float_image,
+    "of floats": lambda p: Image.fromarray(np.zeros((HEIGHT, WIDTH), np.float32)).save(p, format="TIFF"),
 }
 
 
@@ -57,10 +44,9 @@ def test_an_image_that_cannot_be_read_is_named(data, tmp_path, case, i):
     assert name_of(i) in said and "cannot be read" in said and "leave it out" in said
 
 
-@pytest.mark.parametrize("i", [3])
-def test_an_image_of_another_size_is_named(data, tmp_path, i):
+def test_an_image_of_another_size_is_named(data, tmp_path):
     shutil.rmtree(data / "colmap")
-    save(data, i, np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8))
+    Image.new("RGB", (WIDTH + 2, HEIGHT)).save(data / "images" / name_of(3))
     ended = train(data, tmp_path)
     said = ended.sentence
     assert f"{WIDTH + 2} x {HEIGHT} pixels and its camera {WIDTH} x {HEIGHT}" in said and "EXIF" not in said

@@ -1,4 +1,4 @@
-"""Options that cannot be used, or would be ignored, are named before anything is written (docs/errors.md)."""
+"""Options that cannot be used, or would be ignored, are named before anything is written."""
 
 from __future__ import annotations
 

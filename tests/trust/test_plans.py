@@ -1,14 +1,11 @@
-"""Plan files that cannot be used: ns-train ends with one sentence that names file, MPI and field (docs/errors.md)."""
+"""Plan files that cannot be used: ns-train ends with one sentence that names file, MPI and field."""
 
 from __future__ import annotations
 
 import json
-import math
 
 import pytest
 from forked import run, train
-
-NAN, INF = math.nan, math.inf
 
 
 @pytest.fixture(scope="module")
@@ -16,14 +13,6 @@ def plan_text(whole_scene, tmp_path_factory):
     from training_runs import write_plan
 
     return write_plan(whole_scene, tmp_path_factory.mktemp("plan") / "plan.json", with_cube=True).read_text()
-
-
-def mpi(**changes):
-    return lambda plan: plan["mpis"][1].update(changes)
-
-
-def cube(**changes):
-    return lambda plan: plan["cube"].update(changes)
 
 
 def test_a_plan_that_is_usable_trains(whole_scene, plan_text, tmp_path):

@@ -1,4 +1,4 @@
-"""Runs that are stopped, resumed and shared: nothing is lost or mixed up, and one sentence says so (docs/errors.md)."""
+"""Runs that are stopped, resumed and shared: nothing is lost or mixed up, and one sentence says so."""
 
 from __future__ import annotations
 
