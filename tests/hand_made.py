@@ -95,6 +95,21 @@ def observed(poses, pinhole, size, points=(), seen_by=(), seen_point=None, seen_
     )
 
 
+def median_reprojection_error(observations):
+    """Median distance between keypoints and their projected points, as a share of the image width; no lens: tells
+    a model in another frame from a good one."""
+    errors = []
+    for (x, y), i, p in zip(observations.seen_at, observations.seen_by, observations.seen_point, strict=False):
+        pose, (fx, fy, cx, cy) = observations.camera_to_worlds[i], observations.intrinsics[i]
+        right, up, back = np.linalg.inv(pose[:, :3]) @ (observations.points[p] - pose[:, 3])
+        if back >= 0:
+            errors.append(np.inf)
+            continue
+        off = np.array([fx * right / -back + cx - x, -fy * up / -back + cy - y])
+        errors.append(float(np.linalg.norm(off)) / observations.sizes[i, 0])
+    return float(np.median(errors))
+
+
 # Blending ------------------------------------------------------------------------------------------------------------
 
 

@@ -51,8 +51,3 @@ def moved(observations: Observations, turn: np.ndarray, shift: np.ndarray, scale
         camera_to_worlds=np.concatenate([turn @ poses[:, :, :3], centers[:, :, None]], -1),
         points=scale * (observations.points @ turn.T) + shift,
     )
-
-
-def keypoint_errors(scene, found):
-    """Distance of each keypoint of ``SfmPoints`` from where its point projects to, pixels."""
-    return np.linalg.norm(scene.cameras.project(found.camera, found.points[found.point])[0] - found.pixel, axis=-1)

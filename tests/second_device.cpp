@@ -1,5 +1,6 @@
 // A second device in the CPU's memory, for tests without a GPU: torch's operations run on the CPU, and those that are
 // given tensors of both devices are refused as on a GPU.
+#include <ATen/ATen.h>
 #include <ATen/CPUGeneratorImpl.h>
 #include <ATen/core/GeneratorForPrivateuseone.h>
 #include <ATen/detail/PrivateUse1HooksInterface.h>
@@ -10,8 +11,9 @@
 #include <ATen/EmptyTensor.h>
 #include <c10/core/impl/DeviceGuardImplInterface.h>
 #include <c10/core/impl/alloc_cpu.h>
-#include <torch/extension.h>
 #include <torch/library.h>
+
+#include <set>
 
 namespace {
 
@@ -259,8 +261,6 @@ TORCH_LIBRARY_IMPL(aten, PrivateUse1, m) {
   });
 }
 
-}  // namespace
+const bool registered = [] { return at::RegisterPrivateUse1HooksInterface(new Hooks()), true; }();
 
-PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
-  m.def("register_hooks", [] { at::RegisterPrivateUse1HooksInterface(new Hooks()); });
-}
+}  // namespace

@@ -34,10 +34,8 @@ SOURCE = Path(__file__).with_name("second_device.cpp")
 
 def register(build: Path) -> None:
     """Makes ``second`` a device of torch in this process, compiled in a folder (half a minute)."""
-    device: Any = cpp_extension.load(
-        "second_device", [str(SOURCE)], extra_cflags=["-O1", "-DNDEBUG", "-std=c++17"], build_directory=str(build)
-    )
-    device.register_hooks()
+    flags = ["-O0", "-DNDEBUG", "-std=c++17"]
+    cpp_extension.load("second_device", [str(SOURCE)], flags, build_directory=str(build), is_python_module=False)
     torch.utils.rename_privateuse1_backend("second")
     torch._register_device_module("second", _module())
     torch.utils.generate_methods_for_privateuse1_backend(for_storage=True)

@@ -7,13 +7,14 @@ import math
 import pytest
 import torch
 from bricked import bricked_field
-from compiled import both, normal
-from hard_rays import HARD_RAYS, hard_plan, hard_rays
-from interpreting import interpreted  # noqa: F401
+from compiled import both, interpreted, normal  # noqa: F401
 from kernel_cases import CASES, CLOSE, Shapes, differences
 from marches import (
+    HARD_RAYS,
     behind_an_opaque_plane_nothing_is_visited_and_a_hundred_thousandth_is_lost,
     compare,
+    hard_plan,
+    hard_rays,
     nothing_is_marched_without_rays_or_samples,
 )
 from random_fields import bundle, random_field, random_rays, sampled

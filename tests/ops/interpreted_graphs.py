@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from interpreting import interpreted  # noqa: F401
+from compiled import interpreted  # noqa: F401
 from nerfstudio.engine.callbacks import TrainingCallbackLocation as At
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_map_only

@@ -9,7 +9,7 @@ import torch
 from bricked import bricked_field
 from compiled import compiled  # noqa: F401
 from hand_made import make_mpi
-from hard_rays import hard_plan, hard_rays
+from marches import hard_plan, hard_rays
 from random_fields import bundle, random_field, random_rays
 from shows import as_float64_says, compare, nothing_is_shown_of_nothing, shown
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import hand_made
 import numpy as np
 import pytest
-from reprojection import median_reprojection_error
+from hand_made import median_reprojection_error
 
 from mmpi_ns.placement.errors import mpi_errors, pixel_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel

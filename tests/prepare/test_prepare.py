@@ -9,9 +9,9 @@ import corridor
 import numpy as np
 import pycolmap
 import pytest
+from hand_made import median_reprojection_error
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from reprojection import median_reprojection_error
 
 from mmpi_prepare import features, mapping, pipeline
 from mmpi_prepare.adjustment import camera_poses, similarity_between

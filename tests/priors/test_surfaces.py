@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from value_noise import noise
+from corridor import noise
 
 from mmpi_priors.dense import ROUNDS, confirmed, matched
 from mmpi_priors.patches import Surfaces, search_surfaces

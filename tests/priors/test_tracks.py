@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from corridor import noise
 from hand_made import posed
 from PIL import Image
 from tiny_scene import undistort
-from value_noise import noise
 
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors.observe import with_tracks

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hand_made import median_reprojection_error
 from PIL import Image
-from reprojection import median_reprojection_error
 
 from mmpi_priors.sfm import find_sfm_model
 from mmpi_scene import SCENES, Cameras, Scene, make_scene, render, write_dataset
