@@ -6,7 +6,9 @@ log(1 - alpha), while tau is an ordinary number. All arithmetic is float32 or wi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,6 +19,9 @@ from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import HALF
 from mmpi_ns.ops.layout import dense
+
+Run = Callable[..., None]
+"""Compiled code for all rays: takes R, S, numbers, inputs and outputs."""
 
 
 def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
@@ -67,25 +72,35 @@ def composite_weights(
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, run: Run, back: Run, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor
+    ) -> tuple[Tensor, Tensor]:
         weights, depth = torch.empty_like(tau), torch.empty_like(total)
-        call_in_parts("mmpi_composite", *tau.shape, tau, valid, before, total, weights, depth)
+        run(*tau.shape, tau, valid, before, total, weights, depth)
         ctx.save_for_backward(tau, valid, before, weights)
+        ctx.back = back
         return weights, depth
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         tau, *_ = saved = ctx.saved_tensors
         grad = torch.empty_like(tau)
-        call_in_parts("mmpi_composite_back", *tau.shape, *saved, *(g.contiguous() for g in grad_outputs), grad)
-        return grad, None, None, None
+        ctx.back(*tau.shape, *saved, *(g.contiguous() for g in grad_outputs), grad)
+        return None, None, grad, None, None, None
 
 
-@composite_weights.on_cpu
-def composite_weights_on_cpu(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
+def compiled_weights(
+    run: Run, back: Run, tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor
+) -> Composite:
+    """``composite_weights`` by compiled code, which takes sizes, inputs and outputs."""
     tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(skipped_before, skipped_total))
-    weights, depth = _Composite.apply(*tensors)  # type: ignore[misc]
+    weights, depth = _Composite.apply(run, back, *tensors)  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
+
+
+composite_weights.on_cpu(
+    partial(compiled_weights, *(partial(call_in_parts, name) for name in ("mmpi_composite", "mmpi_composite_back")))
+)
 
 
 def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:

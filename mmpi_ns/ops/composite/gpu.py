@@ -4,16 +4,15 @@
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.composite import Composite
+from mmpi_ns.ops.composite import Composite, compiled_weights
 from mmpi_ns.ops.gpu_scene import block_size, launch, one_minus_exp
-from mmpi_ns.ops.layout import dense
 
 NUMBERS = 512
 """Slots of a program."""
@@ -38,7 +37,7 @@ def _light(taus, valids, befores, slot, at, inside):
 
 @triton.jit(do_not_specialize=("num_rays", "slots"))
 def composite_kernel(
-    taus, valids, befores, totals, weights, depths, num_rays, slots, SLOTS: tl.constexpr, BLOCK: tl.constexpr
+    num_rays, slots, taus, valids, befores, totals, weights, depths, SLOTS: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Weights of samples, and optical depths of rays."""
     ray, slot, at, inside = slots_of(tl.program_id(0), num_rays, slots, SLOTS, BLOCK)
@@ -50,7 +49,7 @@ def composite_kernel(
 
 @triton.jit(do_not_specialize=("num_rays", "slots", "to_weights", "to_depths"))
 def composite_back_kernel(
-    taus, valids, befores, weights, to_weights, to_depths, to_taus, num_rays, slots,
+    num_rays, slots, taus, valids, befores, weights, to_weights, to_depths, to_taus,
     SLOTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gradients of optical depths."""
@@ -63,36 +62,13 @@ def composite_back_kernel(
     tl.store(to_taus + at, tl.where(valid, slope, 0.0), inside)
 
 
-def tiles(slots: int, device: torch.device) -> dict[str, int]:
-    """Slots and rays of a program."""
+def by_rows(kernel: Any, num_rays: int, slots: int, *values: Any) -> None:
+    """Runs a kernel that has a row of lanes for each ray: with these numbers, inputs and outputs."""
     columns = int(triton.next_power_of_2(max(1, slots)))
-    return {"SLOTS": columns, "BLOCK": block_size(max(1, NUMBERS // columns), device)}
-
-
-class _Composite(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
-        weights, depth, sizes = torch.empty_like(tau), torch.empty_like(total), tiles(tau.shape[1], tau.device)
-        if tau.numel():
-            launch(composite_kernel, len(tau), sizes["BLOCK"], tau, valid, before, total, weights, depth, *tau.shape,
-                   **sizes)  # fmt: skip
-        else:
-            depth.copy_(total)
-        ctx.save_for_backward(tau, valid, before, weights)
-        return weights, depth
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        tau, valid, before, weights = ctx.saved_tensors
-        grad, sizes = torch.empty_like(tau), tiles(tau.shape[1], tau.device)
-        if tau.numel():
-            given = (g.contiguous() for g in grad_outputs)
-            launch(composite_back_kernel, len(tau), sizes["BLOCK"], tau, valid, before, weights, *given, grad,
-                   *tau.shape, **sizes)  # fmt: skip
-        return grad, None, None, None
+    block = block_size(max(1, NUMBERS // columns), next(x.device for x in values if isinstance(x, Tensor)))
+    launch(kernel, num_rays, block, num_rays, slots, *values, SLOTS=columns, BLOCK=block)
 
 
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
-    tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(skipped_before, skipped_total))
-    weights, depth = _Composite.apply(*tensors)  # type: ignore[misc]
-    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
+    run, back = (partial(by_rows, kernel) for kernel in (composite_kernel, composite_back_kernel))
+    return compiled_weights(run, back, tau, valid, skipped_before, skipped_total)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts
-from mmpi_ns.ops.composite import exclusive_cumsum
+from mmpi_ns.ops.composite import Run, exclusive_cumsum
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import dense
 
@@ -61,15 +62,12 @@ def depth_sums(
 
 class _DepthSums(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, weights: Tensor, inverse_t: Tensor, valid: Tensor, intervals: Tensor, targets: Tensor, scale: float
-    ) -> tuple[Tensor, ...]:
-        rays, slots = valid.shape
-        arrays = [*dense(valid, dtype=torch.bool), *dense(weights, inverse_t, intervals, targets)]
-        sums = [*torch.empty(2, rays), torch.empty(rays, dtype=torch.bool)]
-        call_in_parts("mmpi_depth_sums", rays, slots, scale, *arrays, *sums)
+    def forward(ctx: Any, run: Run, back: Run, scale: float, *arrays: Tensor) -> tuple[Tensor, ...]:
+        valid, weights, *_ = arrays
+        sums = [*weights.new_empty(2, len(valid)), torch.empty_like(valid[:, 0])]
+        run(*valid.shape, scale, *arrays, *sums)
         ctx.save_for_backward(*arrays)
-        ctx.scale = scale
+        ctx.back, ctx.scale = back, scale
         ctx.mark_non_differentiable(sums[2])
         return tuple(sums)
 
@@ -77,12 +75,25 @@ class _DepthSums(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         valid, weights, *_ = saved = ctx.saved_tensors
         gradient = torch.empty_like(weights)
-        call_in_parts("mmpi_depth_sums_back", *valid.shape, ctx.scale, *saved, *dense(*grad_outputs[:2]), gradient)
-        return gradient, None, None, None, None, None
+        ctx.back(*valid.shape, ctx.scale, *saved, *dense(*grad_outputs[:2]), gradient)
+        return None, None, None, None, gradient, None, None, None
+
+
+def compiled_sums(
+    run: Run,
+    back: Run,
+    weights: Tensor,
+    inverse_t: Tensor,
+    valid: Tensor,
+    intervals: Tensor,
+    targets: Tensor,
+    scale: float,
+) -> DepthSums:
+    """``depth_sums`` by compiled code, which takes sizes, scale, inputs and outputs."""
+    arrays = [*dense(valid, dtype=torch.bool), *dense(weights, inverse_t, intervals, targets)]
+    return DepthSums(*_DepthSums.apply(run, back, float(scale), *arrays))  # type: ignore[misc]
 
 
 depth_sums.on_cpu(
-    lambda weights, inverse_t, valid, intervals, targets, scale: DepthSums(
-        *_DepthSums.apply(weights, inverse_t, valid, intervals, targets, scale)  # type: ignore[misc]
-    )
+    partial(compiled_sums, *(partial(call_in_parts, name) for name in ("mmpi_depth_sums", "mmpi_depth_sums_back")))
 )

@@ -4,18 +4,14 @@
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops import depth_sums as definition
-from mmpi_ns.ops.composite.gpu import slots_of, tiles
-from mmpi_ns.ops.depth_sums import DepthSums
-from mmpi_ns.ops.gpu_scene import launch
-from mmpi_ns.ops.layout import dense
+from mmpi_ns.ops.composite.gpu import by_rows, slots_of
 
 REACH = tl.constexpr(definition.REACH)
 
@@ -36,7 +32,7 @@ def _window(inverse_t, targets, ray, exists):
 
 @triton.jit(do_not_specialize=("num_rays", "slots"))
 def depth_sums_kernel(
-    valids, weights, inverse_ts, intervals, targets, spreads, masses, reached, num_rays, slots, scale,
+    num_rays, slots, scale, valids, weights, inverse_ts, intervals, targets, spreads, masses, reached,
     SLOTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     ray, slot, at, inside = slots_of(tl.program_id(0), num_rays, slots, SLOTS, BLOCK)
@@ -58,7 +54,7 @@ def depth_sums_kernel(
 
 @triton.jit(do_not_specialize=("num_rays", "slots", "to_spreads", "to_masses"))
 def depth_sums_back_kernel(
-    valids, weights, inverse_ts, intervals, targets, to_spreads, to_masses, to_weights, num_rays, slots, scale,
+    num_rays, slots, scale, valids, weights, inverse_ts, intervals, targets, to_spreads, to_masses, to_weights,
     SLOTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     ray, slot, at, inside = slots_of(tl.program_id(0), num_rays, slots, SLOTS, BLOCK)
@@ -77,34 +73,8 @@ def depth_sums_back_kernel(
     tl.store(to_weights + at, slope + near * tl.load(to_masses + ray, exists, 0.0), inside)
 
 
-class _DepthSums(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, weights: Tensor, inverse_t: Tensor, valid: Tensor, intervals: Tensor, targets: Tensor, scale: float
-    ) -> tuple[Tensor, ...]:
-        (rays, slots), device = valid.shape, weights.device
-        arrays = [*dense(valid, dtype=torch.bool), *dense(weights, inverse_t, intervals, targets)]
-        spread, mass = torch.zeros(rays, device=device), torch.zeros(rays, device=device)
-        reached, sizes = torch.zeros(rays, dtype=torch.bool, device=device), tiles(slots, device)
-        if weights.numel():
-            launch(depth_sums_kernel, rays, sizes["BLOCK"], *arrays, spread, mass, reached, rays, slots, float(scale),
-                   **sizes)  # fmt: skip
-        ctx.save_for_backward(*arrays)
-        ctx.scale = float(scale)
-        ctx.mark_non_differentiable(reached)
-        return spread, mass, reached
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        _, weights, *_ = saved = ctx.saved_tensors
-        gradient, sizes = torch.empty_like(weights), tiles(weights.shape[1], weights.device)
-        if weights.numel():
-            launch(depth_sums_back_kernel, len(weights), sizes["BLOCK"], *saved, *dense(*grad_outputs[:2]), gradient,
-                   *weights.shape, ctx.scale, **sizes)  # fmt: skip
-        return gradient, None, None, None, None, None
-
-
 def depth_sums(
     weights: Tensor, inverse_t: Tensor, valid: Tensor, intervals: Tensor, targets: Tensor, scale: float
-) -> DepthSums:
-    return DepthSums(*_DepthSums.apply(weights, inverse_t, valid, intervals, targets, scale))  # type: ignore[misc]
+) -> definition.DepthSums:
+    run, back = (partial(by_rows, kernel) for kernel in (depth_sums_kernel, depth_sums_back_kernel))
+    return definition.compiled_sums(run, back, weights, inverse_t, valid, intervals, targets, scale)
