@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.ops.march.rays import Rays
+from mmpi_ns.ops.march import Rays
 from mmpi_ns.scene.geometry import (
     Frames,
     LocalRays,

@@ -23,8 +23,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march import march_on_cpu, show_rays_on_cpu
-from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, Shown, march_on_cpu, show_rays_on_cpu
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, plane_hits, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.settings import SamplingConfig

@@ -18,8 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_ns.utils.arrays import Arrays, Pairs, write_arrays
-from mmpi_ns.utils.files import cache_folder, write_atomically
+from mmpi_ns.utils.files import Arrays, Pairs, cache_folder, write_arrays, write_atomically
 
 VERSION = 2
 """Version of all cached results: those of another version are computed again."""

@@ -32,9 +32,8 @@ from torch import Tensor
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.ops.details import HERE, LEAST_WEIGHT, MIDDLE, STRENGTH, seen_details
 from mmpi_ns.scene.near_views import nearest_views
-from mmpi_ns.utils.arrays import write_arrays
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.files import write_atomically
+from mmpi_ns.utils.files import write_arrays, write_atomically
 
 MAX_ANGLE = 45.0
 """Maximum angle between the viewing directions of an image and of the training images whose details it adds,

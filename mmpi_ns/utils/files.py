@@ -1,15 +1,18 @@
-"""Atomic files, images that may be damaged, and text in a checkpoint."""
+"""Atomic files, images that may be damaged, arrays on disk, and text in a checkpoint."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from mmpi_ns.utils.errors import InputError, WriteError, brief
@@ -18,6 +21,8 @@ if TYPE_CHECKING:
     from jaxtyping import UInt8
     from torch import Tensor
 
+Arrays = Mapping[str, NDArray[np.generic]]
+Pairs = Iterable[tuple[str, NDArray[np.generic]]]
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
 UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
 
@@ -106,3 +111,11 @@ def to_bytes(text: str) -> UInt8[Tensor, "B"]:
 def to_text(data: UInt8[Tensor, "B"]) -> str:
     """Inverse of ``to_bytes``."""
     return bytes(data.cpu().numpy().tolist()).decode()
+
+
+def write_arrays(path: Path, arrays: Arrays | Pairs) -> None:
+    """Writes an .npz, whatever the file's ending."""
+    with zipfile.ZipFile(path, "w") as file:  # as np.savez, which asks for all arrays at once
+        for name, array in arrays.items() if isinstance(arrays, Mapping) else arrays:
+            with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asanyarray(array), version=(1, 0), allow_pickle=False)

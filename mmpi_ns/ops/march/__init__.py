@@ -6,21 +6,124 @@ is left (and less than a sample must weigh to be kept), so a ray costs what lies
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
 from mmpi_ns.ops.build import OPS, call_in_parts, structs
-from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
-from mmpi_ns.ops.march.rays import Capacity as Capacity
-from mmpi_ns.ops.march.rays import MarchOptions as MarchOptions
-from mmpi_ns.ops.march.rays import MergedSamples as MergedSamples
-from mmpi_ns.ops.march.rays import Rays as Rays
-from mmpi_ns.ops.march.rays import Shown, empty_samples
+from mmpi_ns.ops.layout import Places, SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.scene.columns import columns_from
+
+
+class Rays(NamedTuple):
+    """R rays, and the heads that may answer them."""
+
+    origins: Float[Tensor, "R 3"]
+    """World axes, scene units."""
+    directions: Float[Tensor, "R 3"]
+    """Unit, world axes."""
+    nears: Float[Tensor, "R 1"]
+    """Distance at which rays start."""
+    fars: Float[Tensor, "R 1"]
+    """Distance at which rays end; may be inf."""
+    heads: Bool[Tensor, "R H"] | None = None
+    """Heads that may answer each ray; None for all."""
+    priorities: Float[Tensor, "R K"] | None = None
+    """Of the MPIs: each ray is answered by the first one of those it meets (and by the cube). None: by all."""
+
+
+class Capacity(NamedTuple):
+    """Room for the samples of a training batch, so that the sizes of its arrays are known before it is marched."""
+
+    slots: int
+    """Of each ray; the last one stays empty."""
+    heads: tuple[int, ...]
+    """Samples of each head."""
+    rows: int
+    """Distinct rows of the tables."""
+
+
+class MarchOptions(NamedTuple):
+    """Which samples are kept, and how they are blended."""
+
+    threshold: float
+    """Weight below which a sample is dropped; 0 keeps all and ends no ray early."""
+    fair_share: float = float("inf")
+    """Bound on the threshold relative to equal weights (``march.prune``)."""
+    blends: bool = False
+    """Samples are blended by reliability."""
+    capacity: Capacity | None = None
+    """On a GPU: the sizes of what is returned, so that nothing is waited for. Samples beyond are left out
+    (``MergedSamples.numbers`` says so). None: as many as there are."""
+
+    def most_kept(self, samples: int) -> int:
+        """How many of a ray's samples are kept at most: weights sum to at most 1, and each exceeds the bound."""
+        if self.threshold <= 0:
+            return samples
+        return min(samples, int(1.01 / min(self.threshold, self.fair_share / max(samples, 1))) + 2)
+
+
+@dataclass(frozen=True)
+class MergedSamples:
+    """The kept samples of R rays, nearest first in S slots of each ray, and the attenuation by the dropped ones."""
+
+    heads: Int[Tensor, "R S"]
+    """0 in empty slots, like all fields."""
+    planes: Int[Tensor, "R S"]
+    ndc: Float[Tensor, "R S 3"]
+    inverse_t: Float[Tensor, "R S"]
+    tau: Float[Tensor, "R S"]
+    """Optical depth, blended if reliability is used."""
+    skipped_before: Float[Tensor, "R S"]
+    """Optical depth of the dropped samples in front of each sample."""
+    valid: Bool[Tensor, "R S"]
+    skipped_total: Float[Tensor, "R 1"]
+    dropped_mass: Float[Tensor, "R 1"]
+    """Sum of the weights of the dropped samples."""
+    live: Int[Tensor, "R"]
+    """Samples of each ray before dropping."""
+    explained: Bool[Tensor, "R 1"]
+    """Whether the heads that may answer must explain the whole ray: they cover it from before the first content out to
+    infinity, or all heads may answer and one does."""
+    head_counts: tuple[int, ...] | None = None
+    """Samples of each head, if known without synchronising; with a capacity those that there is room for."""
+    capacity: Capacity | None = None
+    """See ``MarchOptions``."""
+    numbers: Int[Tensor, "1+H"] | None = None
+    """The most that a ray keeps, then what is kept of each head; with a capacity alone."""
+
+    @property
+    def places(self) -> Places:
+        return Places(self.heads, self.planes, self.ndc, self.valid)
+
+
+def empty_samples(*shape: int, index: torch.dtype = torch.int64, device: torch.device | str = "cpu") -> list[Tensor]:
+    """Arrays for heads, planes, NDC, inverse distances, optical depths and those skipped before each sample."""
+    types = (index, index, *[torch.float32] * 4)
+    return [torch.empty((*shape, 3) if i == 2 else shape, dtype=t, device=device) for i, t in enumerate(types)]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What rays show."""
+
+    gathered: Float[Tensor, "R C"]
+    """Sums of weight times colour and features, of the samples that are kept."""
+    mass: Float[Tensor, "R 1"]
+    """Sum of their weights."""
+    transmittance: Float[Tensor, "R 1"]
+    """Light behind the last sample; of baked rays 0 where it is less than ``ends.OPAQUE_BAKED``."""
+    accumulation: Float[Tensor, "R 1"]
+    inverse_t: Float[Tensor, "R 1"]
+    """At half the mass (``ops.composite.median_inverse_distance``); 0 for infinity, or without mass."""
+    winner: Float[Tensor, "R 1"]
+    """The head that gives most of the mass."""
+    dropped_mass: Float[Tensor, "R 1"]
 
 
 def shown(name: str, num_rays: int, channels: int, *values: Any, folder: Path = OPS) -> Shown:

@@ -21,8 +21,8 @@ from mmpi_ns.ops import ends
 from mmpi_ns.ops.gather.gpu import activate, sizes
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
-from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
 HALF = tl.constexpr(ends.HALF)

@@ -19,8 +19,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import OPAQUE_BAKED
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.layout import dense, dense_fields, frame_rows, shaped
-from mmpi_ns.ops.march import shown
-from mmpi_ns.ops.march.rays import Rays, Shown
+from mmpi_ns.ops.march import Rays, Shown, shown
 from mmpi_ns.scene.geometry import Frames
 from mmpi_show.ops import OPS
 from mmpi_show.ops.baked import reader
