@@ -19,7 +19,6 @@ from mmpi_ns.settings import (
     MMPIModelConfig,
     MMPIPipelineConfig,
     MMPITrainerConfig,
-    PhaseSchedulerConfig,
     PlacementConfig,
     RenderingConfig,
     ScheduleConfig,
@@ -66,7 +65,7 @@ def _method(
             ),
             model=model,
         ),
-        optimizers={k: {"optimizer": x, "scheduler": PhaseSchedulerConfig(kind=k)} for k, x in optimizers.items()},
+        optimizers={k: {"optimizer": x, "scheduler": None} for k, x in optimizers.items()},
         viewer=ViewerConfig(websocket_host="127.0.0.1", num_rays_per_chunk=1 << 14, quit_on_train_completion=True),
         vis="viewer+tensorboard",
     )

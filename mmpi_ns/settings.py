@@ -10,11 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.engine.optimizers import OptimizerConfig
-from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
@@ -227,18 +226,6 @@ class TouchedAdamConfig(OptimizerConfig):
     _target: Callable[..., Any] = Later("mmpi_ns.training.touched_adam", "TouchedAdam")
     lr: float = 0.1
     """Learning rate at the start of the group's phase."""
-
-
-@dataclass
-class PhaseSchedulerConfig(SchedulerConfig):
-    """Learning rate of one parameter kind: 0 where it is frozen, decaying over each phase in which it trains."""
-
-    _target: Callable[..., Any] = Later("mmpi_ns.training.run", "PhaseScheduler")
-    kind: str = "density"
-    """Parameter kind of the group."""
-    progress: ClassVar[Any] = None
-    """Not an option: the trainer sets it in its copy of the config. Rates follow its schedule, also if a checkpoint
-    replaces that; without it they are constant (a config used outside this trainer)."""
 
 
 @dataclass

@@ -13,11 +13,8 @@ from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
-from nerfstudio.engine.schedulers import Scheduler
 from torch import Tensor, nn
 from torch.nn import Parameter
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.data.datamanager import MMPIDataManager
 from mmpi_ns.data.rays import TrainingRays
@@ -26,7 +23,6 @@ from mmpi_ns.placement.split import cameras_of
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
-from mmpi_ns.settings import PhaseSchedulerConfig
 from mmpi_ns.training.initial import start_from_depths
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.training.reliability import TRAINS, prepare_parameters
@@ -108,16 +104,6 @@ class Progress(nn.Module):
         self.windows = WindowedPlan.from_json(to_text(self.windows_bytes))
         self.schedule = Schedule.from_json(to_text(self.schedule_bytes))
         self.window = int(self.window_number)
-
-
-class PhaseScheduler(Scheduler):
-    """Learning rates of a run's schedule."""
-
-    config: PhaseSchedulerConfig
-
-    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        kind, progress = self.config.kind, self.config.progress
-        return LambdaLR(optimizer, lambda step: progress.schedule.rate_factor(kind, step) if progress else 1.0)
 
 
 def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import sys
 from contextlib import suppress
 from functools import partial
@@ -13,6 +12,7 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
+from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.data.datamanager import MMPIDataManager
 from mmpi_ns.data.dataset import image_and_mask
@@ -24,7 +24,7 @@ from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.sampler import march_options
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.settings import MMPITrainerConfig, PhaseSchedulerConfig
+from mmpi_ns.settings import MMPITrainerConfig
 from mmpi_ns.training.agreement import RAYS as AGREEMENT_RAYS
 from mmpi_ns.training.agreement import disagreement
 from mmpi_ns.training.checkpoints import (
@@ -131,7 +131,7 @@ class MMPITrainer(Trainer):
                 say(f"No GPU is used: {gpu}.")
 
     def setup_optimizers(self) -> Optimizers:
-        """nerfstudio's optimisers, with schedulers that follow the phases."""
+        """nerfstudio's optimisers, with rates of the schedule where no other scheduler is configured."""
         run, manager = getattr(self.pipeline.model, "run", None), self.pipeline.datamanager
         assert isinstance(run, TrainingRun) and isinstance(manager, MMPIDataManager), "MMPITrainer trains MMPIModel"
         self._run, self._manager, progress = run, manager, run.progress
@@ -141,13 +141,12 @@ class MMPITrainer(Trainer):
         if self._follows_capture:
             self.config.steps_per_save = max(self.config.steps_per_save, self._window_steps // 4)
         self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps  # nerfstudio shows these
-        config: dict[str, Any] = {
-            name: entry | {"scheduler": copy.copy(entry["scheduler"])} for name, entry in self.config.optimizers.items()
-        }
-        for entry in config.values():
-            if isinstance(entry["scheduler"], PhaseSchedulerConfig):
-                vars(entry["scheduler"])["progress"] = progress
-        return Optimizers(config, self.pipeline.get_param_groups())
+        optimizers = Optimizers(self.config.optimizers, self.pipeline.get_param_groups())
+        for kind, optimizer in optimizers.optimizers.items():
+            if kind not in optimizers.schedulers:  # of the run's schedule, also if a checkpoint replaces it
+                factor = lambda step, kind=kind: progress.schedule.rate_factor(kind, step)  # noqa: E731
+                optimizers.schedulers[kind] = LambdaLR(optimizer, factor)
+        return optimizers
 
     # Steps --------------------------------------------------------------------------------------------------------
 
