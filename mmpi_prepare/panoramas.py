@@ -34,7 +34,7 @@ SAMPLE = 16
 """Images looked at to find whether those that are twice as wide as high are panoramas."""
 APART = 8
 """Columns of an image that are compared with each other."""
-OTHERS = ("poses", "depths", "focal", "camera")
+OTHERS = ("poses", "depths", "focal", "camera", "lens", "intrinsics", "refine_intrinsics", "undistort")
 """Options for cameras that are not panoramic."""
 
 
@@ -110,9 +110,9 @@ def _places(width: int, height: int, side: int) -> dict[str, tuple[NDArray[np.fl
 
 def check(settings: Settings) -> None:
     """Raises InputError if an option is not for panoramas."""
-    given = [f"--{name}" for name in OTHERS if getattr(settings, name) is not None]
+    given = [f"--{n.replace('_', '-')}" for n in OTHERS if getattr(settings, n) != getattr(Settings, n)]
     if given:
-        raise InputError(f"The images are 360-degree panoramas, whose lens is known: leave {' and '.join(given)} out.")
+        raise InputError(f"Panoramas of a 360-degree camera take no {' and no '.join(given)}: leave it out.")
 
 
 def join(database: Path) -> None:

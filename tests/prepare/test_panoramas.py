@@ -127,8 +127,8 @@ def test_masks_are_cut_like_panoramas(frames, tmp_path):
 
 
 def test_other_images_and_options_among_panoramas_are_refused(frames, tmp_path):
-    with pytest.raises(InputError, match="whose lens is known: leave --focal out"):
-        prepare(Settings(frames, tmp_path / "scene", focal=100.0, threads=1))
+    with pytest.raises(InputError, match="take no --focal and no --refine-intrinsics: leave it out"):
+        prepare(Settings(frames, tmp_path / "scene", focal=100.0, refine_intrinsics=True, threads=1))
     mixed = tmp_path / "mixed"
     mixed.mkdir()
     for file in sorted(frames.iterdir())[:3]:
