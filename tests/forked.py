@@ -44,7 +44,6 @@ class Ended:
     status: int
     out: str
     error: str
-    seconds: float
 
     @property
     def sentence(self) -> str:
@@ -74,14 +73,9 @@ class Running:
         self.folder = Path(tempfile.mkdtemp(prefix="trust", dir=os.environ["XDG_CACHE_HOME"]))  # conftest removes it
         for stream in ("out", "error") if shown_on is not None else ():
             (self.folder / stream).symlink_to(shown_on)
-        self.began = time.monotonic()
         given = (self.folder, name, options, arguments, memory, environment or {})
         self.process = _context.Process(target=_child, args=given, daemon=True)
         self.process.start()
-
-    @property
-    def pid(self):
-        return self.process.pid
 
     def text(self, stream="out"):
         path = self.folder / stream
@@ -95,26 +89,24 @@ class Running:
         assert text in self.text(), (self.text()[-2000:], self.text("error")[-2000:])
 
     def send(self, number):
-        os.kill(self.pid, number)
+        os.kill(self.process.pid, number)
 
     def end(self, timeout=100):
         self.process.join(timeout)
         if self.process.is_alive():
             self.process.kill()
             raise AssertionError(f"still running after {timeout} s: {self.text()[-1000:]}")
-        return Ended(
-            self.process.exitcode, self.text(), self.text("error"), time.monotonic() - self.began
-        )  # fmt: skip
+        return Ended(self.process.exitcode, self.text(), self.text("error"))
 
 
-def start(name, *arguments, options=None, memory=None, environment=None):
-    """Starts a command with arguments, or ns-train with options {dotted name: value} of mmpi-small, unparsed."""
-    return Running(name, options, [str(a) for a in arguments], memory, environment)
+def start(name, *arguments, environment=None):
+    """Starts a command with arguments."""
+    return Running(name, None, [str(a) for a in arguments], None, environment)
 
 
-def run(name, *arguments, options=None, memory=None):
+def run(name, *arguments):
     """Runs a command to its end."""
-    return start(name, *arguments, options=options, memory=memory).end()
+    return start(name, *arguments).end()
 
 
 def train(data, output, method="mmpi_small", memory=None, **options):
@@ -141,12 +133,9 @@ def _child(folder, name, options, arguments, memory, environment):
         resource.setrlimit(resource.RLIMIT_AS, (used + memory, used + memory))
     status = 0
     try:
-        if callable(name):
-            name(*arguments)
-        else:
-            sys.argv = [f"/bin/{name}", *arguments]
-            module = import_module(COMMANDS[name])
-            module.entrypoint() if options is None else module.main(_config(options))
+        sys.argv = [f"/bin/{name}", *arguments]
+        module = import_module(COMMANDS[name])
+        module.entrypoint() if options is None else module.main(_config(options))
     except SystemExit as ended:
         status = ended.code if isinstance(ended.code, int) else 0 if ended.code is None else 1
         if isinstance(ended.code, str):

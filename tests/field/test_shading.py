@@ -195,26 +195,3 @@ def test_changed_odds_and_their_gradients_are_those_of_the_formula():
     wanted = torch.sigmoid(torch.logit(color) + 8 * torch.tanh(change / 2))
     assert torch.allclose(change_odds(color, change), wanted, atol=1e-12)
     assert torch.autograd.gradcheck(change_odds, (color, change))
-
-
-# Growth ----------------------------------------------------------------------------------------------------------
-
-
-def test_growing_keeps_what_rays_show():
-    """Where texels are affine functions of the place on their plane, no resolution changes what lies between them."""
-    plan, draws = random_plan(3, False, seed=4), np.random.default_rng(0)
-    field = MMPIField(plan, shading="ray", feature_channels=6, hidden_width=8).eval()
-    field.build(plan, 1 / 4)
-    field.networks.weights.data = 0.5 * torch.from_numpy(draws.normal(size=field.networks.weights.shape)).float()
-    for grid in field.grids:
-        y, x = (np.linspace(-1, 1, n) for n in (grid.height, grid.width))
-        for table in (field.density, field.features):
-            level, across, down = draws.normal(size=(3, grid.depth, 1, 1, table.shape[1]))
-            values = level + across * x[None, None, :, None] + down * y[None, :, None, None]
-            table.data[grid.rows] = torch.from_numpy(values.reshape(-1, table.shape[1])).float()
-    rays = bundle(*random_rays(plan, 60, seed=1))
-    before, texels = shown(field, rays)[0].rgb, len(field.grids[0].rows)
-    field.grow(1.0)
-    after = shown(field, rays)[0].rgb
-    assert len(field.grids[0].rows) > 2 * texels and before.std() > 0.05
-    assert torch.allclose(before, after, atol=2e-5)

