@@ -16,7 +16,6 @@ PLANES = (  # axis, place, the two other axes
     (2, 4.0, (0, 1)),
     (1, 26.0, (0, 2)),
 )
-OCTAVES = ((1.2, 0.35), (4.0, 0.35), (11.0, 0.3))
 
 
 def noise(u, v, table, octaves):
@@ -63,7 +62,7 @@ def picture(pose, seed=0):
             distance = (place - pose[axis, 3]) / rays[:, axis]
         hit = (distance > 0) & (distance < nearest)
         points = pose[:3, 3] + distance[hit, None] * rays[hit]
-        gray = noise(points[:, others[0]], points[:, others[1]], table, OCTAVES)
+        gray = noise(points[:, others[0]], points[:, others[1]], table, ((1.2, 0.35), (4.0, 0.35), (11.0, 0.3)))
         image[hit] = np.clip(gray[:, None] * np.array([[1.0, 0.95, 0.8], [0.8, 1.0, 0.9]])[number % 2], 0, 1)
         nearest[hit] = distance[hit]
     return (image.reshape(HEIGHT, WIDTH, 3) * 255).round().astype(np.uint8)

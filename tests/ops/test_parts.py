@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+from threading import Thread
 
 import pytest
 import torch
 
 from mmpi_ns.ops import build
 from mmpi_ns.ops.dispatch import fault
+from mmpi_ns.utils import parallel
 
 pytestmark = pytest.mark.skipif(fault("C++") is not None, reason="needs a C++ compiler")
 COUNT = 1000
@@ -32,7 +34,6 @@ def test_every_part_is_done_once_and_before_the_call_ends(parts):
 ROWS = 20_000
 LONG = 1_000_000
 """Rows that take some 20 ms."""
-CONSTANTS = (0.9, 0.99, 1.0, 1e-8, 0.1)
 
 
 def adam_step(seed, count=ROWS):
@@ -40,7 +41,7 @@ def adam_step(seed, count=ROWS):
     g = torch.Generator().manual_seed(seed)
     table, gradient = torch.randn(2, count, 8, generator=g)
     rows, moments = torch.arange(64, count), torch.zeros(count, 2, 8, dtype=torch.bfloat16)
-    return rows, 8, gradient[64:], table, moments, *CONSTANTS
+    return rows, 8, gradient[64:], table, moments, 0.9, 0.99, 1.0, 1e-8, 0.1
 
 
 def leave(step, size=100):
@@ -87,3 +88,31 @@ def test_a_process_that_is_forked_waits_for_no_thread(monkeypatch):
         os._exit(0 if same(step[3:5], stepped(1)) else 1)
     assert os.waitpid(child, 0)[1] == 0
     pending.finish()
+
+
+# Threads of torch and of kernels --------------------------------------------------------------------------------------
+
+
+def test_torch_takes_one_thread_and_kernels_all(three_threads):
+    with parallel.torch_apart():
+        assert (torch.get_num_threads(), parallel.num_threads()) == (1, 3)
+        assert len(build.even_bounds(10_000)) == 4
+        with parallel.torch_apart():
+            assert parallel.num_threads() == 3
+        assert torch.get_num_threads() == 1
+    assert (torch.get_num_threads(), parallel.num_threads()) == (3, 3)
+
+
+def test_a_thread_that_began_within_the_block_has_all_kernel_threads_too(three_threads):
+    seen = []
+
+    def view():
+        torch.ones(2).sum()
+        with parallel.torch_apart():
+            seen.append(parallel.num_threads())
+
+    with parallel.torch_apart():
+        beside = Thread(target=view)
+        beside.start()
+        beside.join()
+    assert seen == [3]
