@@ -29,23 +29,25 @@ inline IntLanes pick(Mask where, IntLanes a, IntLanes b) { return where ? a : b;
 inline Lanes real(IntLanes x) { return __builtin_convertvector(x, Lanes); }
 inline IntLanes truncated(Lanes x) { return __builtin_convertvector(x, IntLanes); } // towards zero
 
-// The bits that any lane has.
-inline uint32_t merged(IntLanes x) {
+// A bit for each lane.
+inline uint32_t bits(Mask where) {
+#ifdef __AVX512F__
+    return _mm512_test_epi32_mask(__m512i(where), __m512i(where));
+#endif
+    where &= IntLanes{1,      1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
+                      1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15};
     int32_t each[WIDTH], all = 0;
-    __builtin_memcpy(each, &x, sizeof each);
+    __builtin_memcpy(each, &where, sizeof each);
     for (int i = 0; i < WIDTH; i++) all |= each[i];
     return uint32_t(all);
 }
 
-inline bool any(Mask where) { return merged(where); }
-
-// A bit for each lane.
-inline uint32_t bits(Mask where) {
-    return merged(where & IntLanes{1,      1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
-                                   1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15});
-}
+inline bool any(Mask where) { return bits(where); }
 
 inline float largest(Lanes x) {
+#ifdef __AVX512F__
+    return _mm512_reduce_max_ps(__m512(x));
+#endif
     float each[WIDTH];
     __builtin_memcpy(each, &x, sizeof each);
     float found = each[0];
@@ -84,6 +86,13 @@ inline IntLanes gather(const int32_t* table, IntLanes at) {
     return IntLanes(_mm512_i32gather_epi32(__m512i(at), table, sizeof *table));
 #endif
     return each_lane<IntLanes>(at, [table](int32_t i) { return table[i]; });
+}
+
+inline Lanes gather(const float* table, IntLanes at) {
+#ifdef __AVX512F__
+    return Lanes(_mm512_i32gather_ps(__m512i(at), table, sizeof *table));
+#endif
+    return each_lane<Lanes>(at, [table](int32_t i) { return table[i]; });
 }
 
 // 1 / x to 1e-7, of what is at least 1e-12.

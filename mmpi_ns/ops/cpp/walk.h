@@ -100,8 +100,8 @@ template <int CELLS> struct Walks {
         const IntLanes down = pick(searching, tile(y_last + back * y_step, stack.down), IntLanes{});
         const IntLanes at_word = pick(searching, l >> 5, IntLanes{});
         const IntLanes place = stack.first_column + (at_word * stack.down + down) * stack.across + across;
-        const IntLanes planes = each_lane<IntLanes>(place, [&](int32_t at) { return columns[at].planes; });
-        const IntLanes first = each_lane<IntLanes>(place, [&](int32_t at) { return columns[at].first; });
+        const IntLanes planes = gather(&columns->planes, 2 * place);
+        const IntLanes first = gather(&columns->first, 2 * place);
         const IntLanes at_left = across * CELLS, at_top = down * CELLS;
         const Lanes leaving = float(stack.planes - 1) + least(leaves(x_last, x_step, x_turns, at_left),
                                                               leaves(y_last, y_step, y_turns, at_top));
@@ -248,7 +248,9 @@ template <typename Texels> class Walker {
         const Mask kept = going & (weight > least_weight);
         for (uint32_t lanes = bits(kept); lanes; lanes &= lanes - 1) {
             const int i = __builtin_ctz(lanes);
-            seen[i].push_back({weight[i], inverse_t[i], h, texels.lookup(reads, i)});
+            Seen& sample = seen[i].emplace_back(); // written in place: a copy would wait for what was just stored
+            sample.weight = weight[i], sample.inverse_t = inverse_t[i], sample.head = h;
+            texels.look_up(reads, i, sample.lookup);
         }
         dropped += pick(kept, Lanes{}, weight);
         light *= through;

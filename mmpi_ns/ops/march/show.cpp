@@ -60,14 +60,11 @@ struct Floats {
         for (int tap = 0; tap < CORNERS; tap++) {
             const IntLanes x = pick(going, column, IntLanes{}) + (tap & 1), y = pick(going, row, IntLanes{}) + (tap >> 1);
             const IntLanes at = tile * CORNERS + (y >> 3) * 2 + (x >> 3);
-            const IntLanes brick = each_lane<IntLanes>(at, [this](int32_t i) { return bricks[i]; });
-            reads.rows[tap] = brick * int32_t(BRICK) + ((y & 7) << 3) + (x & 7);
+            reads.rows[tap] = gather(bricks, at) * int32_t(BRICK) + ((y & 7) << 3) + (x & 7);
             reads.shares[tap] = (tap & 1 ? fx : 1 - fx) * (tap >> 1 ? fy : 1 - fy);
         }
-        const float* biases = scene.biases + scene.grids[k].bias;
-        const IntLanes plane = pick(going, walk.plane, IntLanes{});
-        return softplus_lanes(raw(reads) + each_lane<Lanes>(plane, [&](int32_t l) { return biases[l]; })) *
-               scene.mpis[k].interval;
+        const Lanes bias = gather(scene.biases + scene.grids[k].bias, pick(going, walk.plane, IntLanes{}));
+        return softplus_lanes(raw(reads) + bias) * scene.mpis[k].interval;
     }
 
     Lanes cube_tau(IntLanes index, const Packet& rays, Mask going, Reads& reads) const {
@@ -88,13 +85,11 @@ struct Floats {
     void weighed(const Reads&, Lanes) const {}
 
     // What one of the samples reads, which is asked for at once.
-    Sample lookup(const Reads& reads, int lane) const {
-        Sample sample;
+    void look_up(const Reads& reads, int lane, Sample& sample) const {
         sample.taps = reads.taps;
         for (int tap = 0; tap < reads.taps; tap++)
             sample.rows[tap] = reads.rows[tap][lane], sample.shares[tap] = reads.shares[tap][lane];
         prefetch(features, sample);
-        return sample;
     }
 
     Lanes colors(const Sample& sample, int64_t first) const {
@@ -109,7 +104,7 @@ struct Floats {
     Lanes raw(const Reads& reads) const {
         Lanes sum{};
         for (int tap = 0; tap < reads.taps; tap++)
-            sum += reads.shares[tap] * each_lane<Lanes>(reads.rows[tap], [this](int32_t row) { return scene.density[row]; });
+            sum += reads.shares[tap] * gather(scene.density, reads.rows[tap]);
         return sum;
     }
 };

@@ -105,11 +105,11 @@ struct Bytes {
     }
 
     // What one of the samples reads, which is asked for at once.
-    Lookup lookup(const Reads& reads, int lane) const {
+    void look_up(const Reads& reads, int lane, Lookup& sample) const {
         const uint8_t* line = baked.texels + reads.texel[lane] * channels;
         for (const uint8_t* row : {line, line + 8 * channels})
             __builtin_prefetch(row), __builtin_prefetch(row + 2 * channels - 1);
-        return {reads.texel[lane], reads.fx[lane], reads.fy[lane]};
+        sample = {reads.texel[lane], reads.fx[lane], reads.fy[lane]};
     }
 
     Lanes colors(const Lookup& at, int64_t) const {
