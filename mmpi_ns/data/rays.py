@@ -65,10 +65,11 @@ class CameraRays:
 
     @staticmethod
     def of(cameras: Cameras, device: torch.device | str) -> CameraRays | None:
-        """None if a camera has another type or a time, or if several lenses have more pixels than MOST_DIRECTIONS."""
+        """None if a camera has another type, or if several lenses have more pixels than MOST_DIRECTIONS. Scenes
+        do not change, so cameras' times are left out."""
         kinds = cameras.camera_type.reshape(-1)
         is_fisheye = kinds == CameraType.FISHEYE.value
-        if cameras.times is not None or not bool((is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all()):
+        if not bool((is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all()):
             return None
         focal, principal = torch.cat([cameras.fx, cameras.fy], -1), torch.cat([cameras.cx, cameras.cy], -1)
         pinholes = CameraRays(*(x.to(device, torch.float32) for x in (cameras.camera_to_worlds, focal, principal)))
