@@ -8,6 +8,7 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
 const WHILE_MOVING = 1 / 40, AT_REST = 1; // seconds that a frame may take
 const LEAST_SCALE = 0.1;
+const START = 1 / 6; // place among the training cameras where the page opens, as nerfstudio's viewer (mmpi_ns/viewer.py)
 const MOST_WINDOWS = 4; // on the card at once, unless the camera needs more
 
 function rotated(v, axis, angle) {
@@ -36,11 +37,13 @@ class Page {
     this.details = new Details(gl, header, () => { this.dirty = true; }, (error) => this.fail(error));
     this.windows = new Map(); // on the card, by number, least recently needed first; null while it is on its way
     this.path = header.path.map(cameraOf);
-    const training = header.path.findIndex((pose) => !pose.test);
-    this.start = structuredClone(this.path[Math.max(training, 0)]);
-    this.camera = structuredClone(this.start);
+    const training = this.path.map((_, i) => i).filter((i) => !header.path[i].test);
+    this.start = training[Math.round(START * (training.length - 1))] || 0; // number of a camera
+    $("place").max = this.path.length - 1;
+    this.go(this.start);
     const steps = this.path.slice(1).map((c, i) => Math.hypot(...add(c.eye, this.path[i].eye, -1)));
-    const near = header.windows[0].content_near || 1;
+    const near = header.windows[0].content_near || 1, length = steps.reduce((a, b) => a + b, 0);
+    this.pace = Math.min(near / Math.max(length, 1e-6) * steps.length, 4); // of Play, cameras a second
     this.speed = Math.max(4 * (steps.sort((a, b) => a - b)[steps.length >> 1] || 0), near / 4); // a second
   }
 
@@ -129,6 +132,7 @@ class Page {
         this.dirty = false;
       }
     }
+    $("play").checked = this.playing !== null;
     if (!this.failed) requestAnimationFrame((t) => this.frame(t));
   }
 
@@ -146,11 +150,24 @@ class Page {
 
   play(elapsed) {
     if (this.playing === null) return false;
-    this.playing += elapsed * 4; // cameras of the path a second
-    const last = this.path.length - 1, at = Math.min(this.playing, last), i = Math.min(Math.floor(at), Math.max(last - 1, 0));
-    this.camera = between(this.path[i], this.path[Math.min(i + 1, last)], at - i);
-    if (at >= last) this.playing = null;
+    this.playing += elapsed * this.pace;
+    const last = this.path.length - 1;
+    this.go(Math.min(this.playing, last));
+    if (this.playing >= last) this.playing = null;
     return true;
+  }
+
+  // To a place on the captured path: at whole numbers that of a camera.
+  go(place) {
+    const last = this.path.length - 1, i = Math.min(Math.floor(place), Math.max(last - 1, 0));
+    this.camera = between(this.path[i], this.path[Math.min(i + 1, last)], place - i);
+    $("place").value = place;
+  }
+
+  // The number of the camera nearest to where one stands.
+  nearestCamera() {
+    const distances = this.path.map((c) => Math.hypot(...add(c.eye, this.camera.eye, -1)));
+    return distances.indexOf(Math.min(...distances));
   }
 
   turn(dx, dy) { // pixels of the screen
@@ -195,8 +212,9 @@ class Page {
   }
 
   press(key) {
-    if (key === "p" || key === " ") this.playing = this.playing === null ? 0 : null;
-    else if (key === "r") { this.playing = null; this.camera = structuredClone(this.start); }
+    const place = Number($("place").value);
+    if (key === "p" || key === " ") this.playing = this.playing !== null ? null : place < this.path.length - 1 ? place : 0;
+    else if (key === "r" || key === "n") { this.playing = null; this.go(key === "r" ? this.start : this.nearestCamera()); }
     else if (key === "1" || key === "2" || key === "3") this.mode = Number(key) - 1;
     else if (key === "m") {
       const window = this.nearest(), head = this.alone ? this.alone.head + 1 : 0;
@@ -225,6 +243,9 @@ function listen(page, canvas) {
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (e) => pointers.delete(e.pointerId));
   canvas.addEventListener("wheel", (e) => { e.preventDefault(); page.dolly(-Math.sign(e.deltaY) * 0.2); }, { passive: false });
+  $("place").addEventListener("input", (e) => { page.playing = null; page.go(Number(e.target.value)); page.touched(); });
+  $("play").addEventListener("click", () => page.press("p"));
+  $("nearest").addEventListener("click", () => page.press("n"));
   const name = (e) => (e.key.length === 1 ? e.key.toLowerCase() : e.key);
   addEventListener("keydown", (e) => {
     if (e.ctrlKey || e.metaKey || e.altKey) return;

@@ -118,6 +118,15 @@ def test_controls_move_the_camera(opened):
     assert np.allclose(eye(opened), opened.evaluate("mmpi.path[1].eye"))
     opened.evaluate("mmpi.press('r')")
     assert np.allclose(eye(opened), before)
+    ends = opened.evaluate("[mmpi.path[0].eye, mmpi.path.at(-1).eye]")
+    for place in (1, 0):
+        opened.evaluate(f"$('place').value = {place} * $('place').max; $('place').dispatchEvent(new Event('input'))")
+        assert np.allclose(eye(opened), ends[-place])
+    opened.evaluate("mmpi.camera.eye = mmpi.camera.eye.map((x) => x + 1e-3); $('nearest').click()")
+    assert np.allclose(eye(opened), ends[0])
+    opened.evaluate("$('play').click()")
+    opened.until("mmpi.playing === null && !$('play').checked")
+    assert np.allclose(eye(opened), ends[1])
 
 
 def test_keys_choose_what_is_shown(opened):
