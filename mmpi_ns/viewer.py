@@ -59,7 +59,7 @@ class CapturedPath:
     @property
     def start(self) -> int:
         """Camera where a window opens."""
-        return round(START * (len(self) - 1))
+        return int(START * (len(self) - 1) + 0.5)  # as the exported page
 
     def at(self, place: float) -> View:
         """The view at a place in [0, num_cameras - 1]: at whole numbers that of a camera (Catmull-Rom between them)."""
