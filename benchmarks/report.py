@@ -162,8 +162,8 @@ def title(text: str) -> str:
 
 def fingerprint() -> str:
     """Hash of torch's version and of the sources of the packages and the benchmarks."""
-    folders = [Path(module.__file__).resolve().parent for module in (mmpi_ns, mmpi_priors, mmpi_scene)]
-    folders.append(Path(__file__).resolve().parent)
+    files = (mmpi_ns.__file__, mmpi_priors.__file__, mmpi_scene.__file__, __file__)
+    folders = [Path(file).resolve().parent for file in files]
     digest = hashlib.sha256(torch.__version__.encode())
     for path in sorted(p for folder in folders for p in folder.rglob("*") if p.suffix in (".py", ".cpp", ".h")):
         digest.update(path.read_bytes())
