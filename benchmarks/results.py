@@ -175,7 +175,8 @@ def results_page(content: Row, scored: Row) -> str:
         "GiB": "{gib:.1f}",
         "rendering, rays/s": "{num_rays_per_sec:.0f}",
     }
-    missing = [key for key, row in content["rows"].items() if "not_run" in row]
+    done = finished(content)
+    missing = [v.key for v in VARIANTS if not all(f"{v.key}, seed {seed}" in done for seed in v.seeds)]
     blocks = [stamp_line(content["made"])]
     for title, group in (("Defaults", "captures"), ("Longer and shorter", "length"), ("The paper's methods", "paper")):
         if rows := means(content, group):

@@ -54,7 +54,7 @@ def test_one_place_can_be_trained_on_request_and_says_what_it_cannot_learn(data,
     config = trainer_config(data, None, tmp_path, 4, training="joint")
     config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(auto_scale_poses=False)
     trainer = ready(config)
-    assert "one place: no distance can be learned" in " ".join(capsys.readouterr().out.split())
+    assert "have the same position: depths cannot be learned" in " ".join(capsys.readouterr().out.split())
     trainer.train()
     assert len(trainer.pipeline.model.field.full_plan.mpis) == 1
     assert all(torch.isfinite(p).all() for p in trainer.pipeline.model.parameters())
