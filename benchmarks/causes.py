@@ -50,6 +50,7 @@ class Causes(Bench):
     def run(self) -> None:
         torch.set_num_threads(self.cores)
         report = Report(self, key=None)
+        report.content["images"] = self.images
         for config in self.load_configs:
             pipeline = load_model(config)
             scene = Path(pipeline.datamanager.config.data).name
@@ -167,7 +168,8 @@ def markdown(content: Row) -> str:
         lambda r, name: f"{r['pixels'][name]:.0%}, {r['error'][name]:.0%}"
     )
     said = (
-        "Means over test images (and training images) of the field alone, without details. Colours: by the affine map "
+        f"Means over {f'at most {n} evenly spaced' if (n := content['images']) else 'all'} test images (and training "
+        "images) of the field alone, without details. Colours: by the affine map "
         "that suits each image best. Pose: where the frozen model shows the image best. Training images see a point, "
         "by the model's own depth, where they show nothing that is more than 5 % nearer."
     )

@@ -31,7 +31,7 @@ class DemoError(ValueError):
 
 @dataclass
 class Demo:
-    """Makes a procedural scene, trains mmpi-small on it, evaluates it, and takes pictures. A rerun continues where the
+    """Makes a procedural scene, trains mmpi on it, evaluates it, and takes pictures. A rerun continues where the
     last one stopped."""
 
     folder: Path = Path("demo")
@@ -63,7 +63,7 @@ class Demo:
         self._prepare_folder()
         self._part(1, f"the {self.kind}: {self.images} images")
         self._make_scene()
-        self._part(2, f"training mmpi-small for {self.steps} steps")
+        self._part(2, f"training mmpi for {self.steps} steps")
         self._train()
         self._part(3, "evaluating on the images held out")
         results = self._evaluate()
@@ -76,7 +76,7 @@ class Demo:
 
     @property
     def run(self) -> Path:
-        return self.folder / "runs" / self.kind / "mmpi-small" / "demo"
+        return self.folder / "runs" / self.kind / "mmpi" / "demo"
 
     @property
     def page(self) -> Path:
@@ -132,7 +132,7 @@ class Demo:
             print(f"Continuing from step {newest}.")
         every = str(max(1, self.steps // 12))
         self._command(
-            "ns-train", "mmpi-small", "--data", str(self.scene), "--output-dir", str(self.folder / "runs"),
+            "ns-train", "mmpi", "--data", str(self.scene), "--output-dir", str(self.folder / "runs"),
             "--experiment-name", self.kind, "--timestamp", "demo", "--max-num-iterations", str(self.steps),
             "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
             "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
@@ -179,9 +179,7 @@ class Demo:
         if not times.is_file():
             raise DemoError(f"{times} is gone, so nobody knows when training began: start afresh with --fresh.")
         started = json.loads(times.read_text(encoding="utf-8"))["started"]
-        draw_curve(
-            self.run, self.folder / "psnr.png", started, f"mmpi-small, {self.steps} steps on the demo's {self.kind}"
-        )
+        draw_curve(self.run, self.folder / "psnr.png", started, f"mmpi, {self.steps} steps on the demo's {self.kind}")
 
     def _write_page(self) -> None:
         if not self._is_newer(self.page):

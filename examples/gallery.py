@@ -53,7 +53,7 @@ COLUMNS = {
 
 @dataclass
 class Gallery:
-    """Trains each procedural scene with mmpi-small and writes gallery.md with a picture and a clip of it. Results of an
+    """Trains each procedural scene with mmpi and writes gallery.md with a picture and a clip of it. Results of an
     earlier run are kept."""
 
     folder: Path = Path("gallery")

@@ -185,6 +185,10 @@ def test_rays_of_pinhole_cameras_are_nerfstudios(scene):
     for name in ("origins", "directions", "camera_indices"):
         assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6), name
     assert ours.pixel_area.shape == theirs.pixel_area.shape
+    timed = copy.deepcopy(cameras)
+    timed.times = torch.zeros(len(cameras), 1)  # as the viewer's
+    made = CameraRays.of(timed, "cpu")
+    assert made is not None and torch.equal(made(indices).directions, ours.directions)
     image, whole = image_rays(cameras[0:1]), cameras[0:1].generate_rays(camera_indices=0, keep_shape=True)
     for name in ("origins", "directions", "camera_indices"):
         assert getattr(image, name).shape == getattr(whole, name).shape

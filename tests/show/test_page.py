@@ -17,6 +17,7 @@ from random_bricks import random_window, scene_of
 import mmpi_ns
 import mmpi_show
 from mmpi_ns.scene.windows import window_shares
+from mmpi_ns.viewer import CapturedPath
 from mmpi_show.files import HEADER, read_baked, write_baked
 from mmpi_show.ops.baked.reader import camera_rays
 from mmpi_show.scene import neighbours, take_borders
@@ -182,6 +183,7 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
     difference = lambda number: np.square(shown(tab, number) - ours(tmp_path, path[number])).mean()  # noqa: E731
     with served(tmp_path) as address:
         assert tab.open(f"{address}/index.html") == "ready"
+        assert tab.evaluate("mmpi.start") == CapturedPath(np.stack([view.to_world for view in path])).start
         assert tab.evaluate("mmpi.windows.size") <= 3  # the two that meet at the first camera, and the nearest one
         tab.evaluate("mmpi.camera = structuredClone(mmpi.path[0]); mmpi.touched(); mmpi.feed()")
         tab.until("mmpi.windows.get(0)?.whole")
