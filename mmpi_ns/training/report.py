@@ -23,12 +23,9 @@ LEAST_SECONDS, MOST_SECONDS = 2.0, 30.0
 """Minimum seconds between two lines."""
 VIEWS, LOOK_SECONDS = 4, 20.0
 """Quick test: maximum number of test images, and seconds after which no further one is started."""
-CPU_RAYS = 15000.0
-"""Pixel rays/s that one core trains with default settings: 21,000 on kitti-street at a quarter, 12,000 on kitchen at a
-half (one core of an Intel Xeon)."""
-ONE_THREAD = 0.6
-"""Share of a training that runs on one thread: 1,500 steps of kitti-street /4 took 78 s with one thread, 62 s with two
-on two free cores (docs/ablations.md)."""
+EARLY_COST = 2.0
+"""Time of a step before surfaces have formed, relative to a later one: rays have more samples then. 1.6 to 2.4 on
+kitti-street, fox and room-walk (docs/ablations.md)."""
 
 
 @dataclass(eq=False)
@@ -65,23 +62,15 @@ class TrainingLog:
         psnr = -10 * math.log10(max(float(rgb_loss.detach()), 1e-12))
         say(
             f"step {done:,} of {self.end:,} | {where} | {self.rays * since / max(seconds, 1e-9):,.0f} rays/s | "
-            f"batch PSNR {psnr:.1f} dB | {duration(each * (self.end - done))} left"
+            f"batch PSNR {psnr:.1f} dB | {duration(each * self.remaining(step))} left"
         )
         self._said_at, self._said, self._phase = now, done, where
 
-
-def forecast(steps: int, rays: int, threads: int, cores: float) -> str:
-    """Training time of steps of so many rays on this machine's CPU, and a warning if threads outnumber free cores."""
-    together = max(1.0, min(threads, cores))
-    seconds = steps * rays / CPU_RAYS * (ONE_THREAD + (1 - ONE_THREAD) / together)
-    work = f"{steps:,} steps of {rays:,} rays"
-    text = f"Without a GPU, {work} take about {duration(seconds)}, or more with large plans."
-    if threads > 1 and cores < threads - 0.5:
-        text += (
-            f"\n{threads} threads run and {cores:.1f} cores are free, so they wait for each other: end other programs, "
-            f"or start with OMP_NUM_THREADS={max(1, round(cores))}."
-        )
-    return text
+    def remaining(self, step: int) -> float:
+        """Steps after this one, each counted by its time relative to this step's."""
+        formed = [self.schedule.sharpened(s) for s in range(step, self.end)]
+        rest = sum(1.0 if after else EARLY_COST for after in formed[1:])
+        return rest / (1.0 if formed[0] else EARLY_COST)
 
 
 @torch.no_grad()

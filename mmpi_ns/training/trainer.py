@@ -39,7 +39,7 @@ from mmpi_ns.training.checkpoints import (
     write_plan,
 )
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
+from mmpi_ns.training.report import TrainingLog, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.step_graph import StepGraphs
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
@@ -125,8 +125,11 @@ class MMPITrainer(Trainer):
                 + (f" {rays:,} rays a step, {times} times the method's, suit this GPU." if times > 1 else "")
             )
         if not str(self.device).startswith("cuda"):
-            rays = self._manager.get_train_rays_per_batch()
-            say(forecast(self._total_steps, rays, num_threads(), free_cores()))
+            if num_threads() > 1 and (cores := free_cores()) < num_threads() - 0.5:
+                say(
+                    f"{num_threads()} threads run and {cores:.1f} cores are free, so they wait for each other: end "
+                    f"other programs, or start with OMP_NUM_THREADS={max(1, round(cores))}."
+                )
             if gpu := unused_gpu():
                 say(f"No GPU is used: {gpu}.")
 
