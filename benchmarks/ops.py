@@ -125,13 +125,13 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
 
     samples = sample()
     lookup = field._lookup(bundle, samples)
-    (num_rays, slots), live, kept = lookup.shape, float(samples.live.sum()), float(len(lookup.index))
+    (num_rays, slots), intersected, kept = lookup.shape, float(samples.num_intersected.sum()), float(len(lookup.index))
     channels, rows, taps = field.feature_channels, float(len(lookup.rows)), lookup.taps[0]
-    counts = {"rays": num_rays, "live": live, "kept": kept, "rows": rows, "pixels": len(batch["image"])}
+    counts = {"rays": num_rays, "intersected": intersected, "kept": kept, "rows": rows, "pixels": len(batch["image"])}
     kept_bytes = 2 * 4 + 3 * 4 + 3 * 4 + 1  # head and plane, position, distance and depths, whether valid
     ops = [
-        Op("march: look up, merge, keep", sample, live * 4 * 4 + kept * kept_bytes),
-        _sort(samples.live, slots),
+        Op("march: look up, merge, keep", sample, intersected * 4 * 4 + kept * kept_bytes),
+        _sort(samples.num_intersected, slots),
         _index(lookup.rows[taps.positions], len(field.density), rows),
     ]
     ops += _interpolation(field, lookup, channels)
@@ -141,12 +141,12 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
     return ops, counts
 
 
-def _sort(live: Tensor, slots: int) -> Op:
+def _sort(intersected: Tensor, slots: int) -> Op:
     """Merging by one stable sort, as the plain path does (the compiled march merges as it goes)."""
-    count, width = int(live.sum()), int(live.max())
-    rays = torch.repeat_interleave(torch.arange(len(live), device=live.device), live)
-    keys = torch.rand(count, generator=torch.Generator().manual_seed(slots)).to(live.device)
-    return Op("merge by a sort", lambda: merge(rays, keys, live), count * (8 + 4) + len(live) * width * 9)
+    count, width = int(intersected.sum()), int(intersected.max())
+    rays = torch.repeat_interleave(torch.arange(len(intersected), device=intersected.device), intersected)
+    keys = torch.rand(count, generator=torch.Generator().manual_seed(slots)).to(intersected.device)
+    return Op("merge by a sort", lambda: merge(rays, keys, intersected), count * (8 + 4) + len(intersected) * width * 9)
 
 
 def _index(rows: Tensor, table_rows: int, distinct: float) -> Op:
@@ -268,8 +268,8 @@ so no lookup can reach it."""
         c = rows[stage]["counts"]
         blocks += [f"## {title(stage)} in training"]
         blocks += [
-            f"{c['rays']} rays ({c['pixels']} of pixels), {c['live'] / c['rays']:.0f} live samples a ray of which "
-            f"{c['kept'] / c['rays']:.0f} are kept, {c['rows'] / 1e3:.0f} thousand distinct rows. A step took "
+            f"{c['rays']} rays ({c['pixels']} of pixels), {c['intersected'] / c['rays']:.0f} intersected samples a ray "
+            f"of which {c['kept'] / c['rays']:.0f} are kept, {c['rows'] / 1e3:.0f} thousand distinct rows. A step took "
             f"{rows[stage]['step_ms']:.0f} ms."
         ]
         blocks += [table(columns, ({"name": name, **r} for name, r in rows[stage]["ops"].items()))]

@@ -25,7 +25,7 @@ def images_of(pipeline: Any, count: int = 0) -> Iterator[Image]:
 
 
 def crossings(hits: PlaneHits, frames: Frames, k: int, planes: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Every plane of MPI k, nearest first: whether it is live, the tangents u and v, and 1/t. [R, L] each"""
+    """Every plane of MPI k, nearest first: whether it is intersected, the tangents u and v, and 1/t. [R, L] each"""
     m = torch.arange(planes - 1, -1, -1).expand(len(hits.count), -1)
     w = sample_disparity(m, frames.disparity_steps[k], frames.last_disparities[k])
     first, count = hits.m_first[:, k, None], hits.count[:, k, None]

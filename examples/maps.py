@@ -13,7 +13,7 @@ from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 FINER = 3
 """Drawn so many times larger, then averaged."""
-SHOWN_PLANES = 14
+DRAWN_PLANES = 14
 
 
 @dataclass(frozen=True)
@@ -126,5 +126,5 @@ class Map:
 
 def plane_depths(mpi: MPIPlan) -> list[float]:
     """Depths of some of an MPI's planes, evenly spaced in disparity as all are, without the last one."""
-    shares = np.linspace(0, 1, min(SHOWN_PLANES, mpi.planes), endpoint=False)
+    shares = np.linspace(0, 1, min(DRAWN_PLANES, mpi.planes), endpoint=False)
     return (mpi.near / (1 - mpi.depth_share * shares)).tolist()

@@ -42,13 +42,13 @@ def blend_shares(
     highest = torch.where(covers, reliability, torch.full_like(reliability, lowest)).amax(-1, keepdim=True).detach()
     reliability = reliability - highest
     is_own = torch.arange(covers.shape[-1], device=covers.device) == heads[:, None]
-    own_value = torch.where(is_own, reliability, torch.zeros_like(reliability)).sum(-1)
+    value_of_head = torch.where(is_own, reliability, torch.zeros_like(reliability)).sum(-1)
     others = covers & ~is_own
     has_others = others.any(-1)
     # A row without others would be a logsumexp over nothing: give it a harmless row and mask the result.
     other_values = torch.where(others, reliability, torch.full_like(reliability, lowest))
     other_values = torch.where(has_others[:, None], other_values, torch.zeros_like(other_values))
-    odds = torch.logsumexp(other_values, -1) - own_value
+    odds = torch.logsumexp(other_values, -1) - value_of_head
     # With softplus, both logs and both slopes are exact at P near 0 and 1; differences from the sum would cancel there.
     # Above the threshold torch returns its argument; at the default of 20 this would be wrong in float64.
     over, under = (torch.nn.functional.softplus(x, threshold=50) for x in (odds, -odds))

@@ -31,8 +31,8 @@ from mmpi_ns.rendering.rendered import (
     Exposures,
     background_of,
     bounded,
+    render_outputs,
     render_rays,
-    shown_outputs,
     winners,
 )
 from mmpi_ns.rendering.window_store import WindowStore
@@ -47,7 +47,7 @@ from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.phases import make_schedule
 from mmpi_ns.training.reliability import assign_heads, blends_in
 from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import InputError, log
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import Generators
 from mmpi_ns.viewer import PathControls
@@ -103,8 +103,8 @@ class MMPIModel(Model):
                 "refine them before (mmpi-prepare --refine-poses), or give --pipeline.model.placement.window-length 0."
             )
         scale_is_free = capture is not None and not len(capture.observations.seen_by)
-        release, moves = config.schedule.release_weight, [*self.camera_optimizer.parameters()]
-        self.run = TrainingRun(self.progress, self.field, self.store, views, release, moves, scale_is_free)
+        release, adjustments = config.schedule.release_weight, [*self.camera_optimizer.parameters()]
+        self.run = TrainingRun(self.progress, self.field, self.store, views, release, adjustments, scale_is_free)
         self.register_load_state_dict_post_hook(type(self)._take_plan)
 
     def _is_joint(self, windows: WindowedPlan) -> bool:
@@ -185,9 +185,9 @@ class MMPIModel(Model):
 
         if len(windows) == 1:
             return render(0, slice(None))
-        shown = present.index(chosen[0]) if chosen is not None and chosen[0] in present else None
+        only = present.index(chosen[0]) if chosen is not None and chosen[0] in present else None
         in_memory = [i for i, window in enumerate(present) if window in (trained, *self.store.in_memory)]
-        return render_windows(bundle.origins, tuple(windows.windows[w] for w in present), render, shown, in_memory)
+        return render_windows(bundle.origins, tuple(windows.windows[w] for w in present), render, only, in_memory)
 
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
@@ -204,7 +204,7 @@ class MMPIModel(Model):
             head_mask = (heads == head).expand(len(bundle), -1)
             blends = False
         threshold = self.config.rendering.threshold
-        outputs = shown_outputs(bundle, field, blends=blends, threshold=threshold, head_mask=head_mask)
+        outputs = render_outputs(bundle, field, blends=blends, threshold=threshold, head_mask=head_mask)
         behind = outputs.pop("transmittance") * background.to(outputs["rgb"])
         outputs |= winners(outputs, bundle, field, first_head)
         exposure = self.exposures.mean
@@ -250,7 +250,7 @@ class MMPIModel(Model):
         if self.config.rendering.nearest_images and folder is not None and self.capture is None:
             self.details = details_of(folder.parent / DETAILS_FOLDER, step)
             if self.details is None:
-                say("This checkpoint has no details of the training images (they are made after the last step): images "
+                log("This checkpoint has no details of the training images (they are made after the last step): images "
                     "show the field alone.")  # fmt: skip
 
     @property
@@ -260,7 +260,7 @@ class MMPIModel(Model):
             return self.config.eval_num_rays_per_chunk
         most = max(plan.largest.samples_per_ray for plan in self.progress.windows.plans)
         field, kept = self.field, MarchOptions(self.config.rendering.threshold).most_kept(most)
-        one_pass = field.shading == "ray" and dispatch.form_of("show_rays", field.features) != "reference"
+        one_pass = field.shading == "ray" and dispatch.form_of("render_fused", field.features) != "reference"
         return rays_per_chunk(most, self.device, kept if one_pass else None)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
@@ -284,7 +284,7 @@ class MMPIModel(Model):
         held = self.decay if dispatch.on_gpu(self.decay) else decay
         total, errors = batch_losses(rays, self.field, image, self.config.loss, g, step, held)
         if rays.lookup is not None and self.progress.schedule.watches(step):
-            self.field.note_use(rays.lookup, rays.composite.weights, rays.samples.live, errors)
+            self.field.note_use(rays.lookup, rays.composite.weights, rays.samples.num_intersected, errors)
         self.camera_optimizer.get_loss_dict(total)
         # A batch of rays that meet nothing trainable would have no gradient; this adds 0 with a gradient.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()
@@ -294,8 +294,8 @@ class MMPIModel(Model):
         if "training" not in outputs:
             return {"psnr": -10 * torch.log10(photometric(outputs["rgb"], self.observed(batch)))}
         samples = outputs["training"].samples
-        live, kept = samples.live.float().mean(), samples.valid.float().sum() / len(samples.live)
-        counts = {"live_samples": live, "kept_samples": kept, "dropped_mass": samples.dropped_mass.mean()}
+        intersected, kept = samples.num_intersected.float().mean(), samples.valid.sum(-1).float().mean()
+        counts = {"intersected_samples": intersected, "kept_samples": kept, "dropped_mass": samples.dropped_mass.mean()}
         self.camera_optimizer.get_metrics_dict(counts)
         return counts
 

@@ -1,7 +1,8 @@
 """Sample and merge: each ray is sampled in every head's NDC, and the samples are merged by distance (paper sec. III-B).
 
 The steps for a ray: its intersections with all planes, in closed form (``crossings``); a sample at each, in the NDC of
-its head (``_live_samples``); all samples in order of distance (``merge``); and the ones with enough weight (``prune``).
+its head (``_intersected_samples``); all samples in order of distance (``merge``); and those with enough weight
+(``prune``).
 ``march`` does all four without gradients: the field differentiates through the kept samples.
 
 This is the definition in plain torch; the C++ and Triton forms are in ``ops/march``.
@@ -23,7 +24,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, Shown, march_on_cpu, show_rays_on_cpu
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, RayOutputs, Rays, march_on_cpu, render_fused_on_cpu
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, plane_hits, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.settings import SamplingConfig
@@ -74,8 +75,8 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
         options: which samples are kept, and how they are blended.
     """
     hits = plane_hits(*rays[:4], layout.frames)
-    first, counts, explained = crossings(layout, rays, hits)
-    flat = _live_samples(layout, tables, rays, hits, first, counts)
+    first, counts, fully_covered = crossings(layout, rays, hits)
+    flat = _intersected_samples(layout, tables, rays, hits, first, counts)
     per_ray = counts.sum(-1)
     order, valid = merge(flat.rays, flat.inverse_t, per_ray)
     tau = flat.tau
@@ -105,13 +106,13 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     columns = (flat.heads, flat.planes, flat.ndc, flat.inverse_t, tau)
     heads, planes, ndc, inverse_t, tau = (torch.cat([x, x.new_zeros(1, *x.shape[1:])])[order] for x in columns)
     before, total, mass = skipped
-    return MergedSamples(heads, planes, ndc, inverse_t, tau, before, valid, total, mass, per_ray, explained)
+    return MergedSamples(heads, planes, ndc, inverse_t, tau, before, valid, total, mass, per_ray, fully_covered)
 
 
 @operation("gpu", kernels="mmpi_ns.ops.march")
-def show_rays(
+def render_fused(
     layout: SceneLayout, tables: Tables, features: Float[Tensor, "T C"], rays: Rays, options: MarchOptions
-) -> Shown:
+) -> RayOutputs:
     """Sums of colours and features along rays, transmittance and depth: images, in one pass.
 
     On a GPU without synchronisation. The compiled form on a CPU processes sixteen rays at a time and skips empty tiles,
@@ -127,7 +128,7 @@ def show_rays(
     m = march(layout, tables, rays, options)
     composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)
     sums = gather_places(layout, features, m.places, composite.weights)
-    return Shown(
+    return RayOutputs(
         gathered=sums.gathered,
         mass=composite.weights.sum(-1, keepdim=True),
         transmittance=composite.transmittance,
@@ -148,7 +149,7 @@ def crossings(
 
     Returns:
         m of each head's nearest intersected plane (of the cube, which comes last, its first sample), number of samples
-        of each head, and ``MergedSamples.explained``.
+        of each head, and ``MergedSamples.fully_covered``.
     """
     first, counts = hits.m_first, hits.count
     if rays.priorities is not None:
@@ -160,27 +161,27 @@ def crossings(
         first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, count[:, None]], -1)
     if rays.heads is not None:
         counts = torch.where(rays.heads, counts, torch.zeros_like(counts))
-    explained = (counts > 0).any(-1, keepdim=True)
+    fully_covered = (counts > 0).any(-1, keepdim=True)
     if rays.heads is not None or rays.priorities is not None:
         # Fully covered: some head contains the ray out to infinity, and the first head is entered before the first
         # content. The plane before the first intersected one bounds the entry; if it lies behind the camera, the ray
         # starts inside.
-        live, frames = counts[:, : len(layout.mpis)] > 0, layout.frames
+        intersected, frames = counts[:, : len(layout.mpis)] > 0, layout.frames
         m_before = torch.minimum(hits.m_first + 1, frames.num_planes - 1)
         w = sample_disparity(m_before, frames.disparity_steps, frames.last_disparities)
         oz, dz = hits.local_origins[..., 2], hits.local_directions[..., 2]
         starts_inside = w * oz >= 1
         entry = torch.where(starts_inside, torch.inf, w * dz / torch.where(starts_inside, 1, 1 - w * oz))
-        endless = live & (hits.m_first - counts[:, : len(layout.mpis)] < 0) & (frames.last_disparities == 0)
-        explained &= (live & (entry * layout.content_near >= 1)).any(-1, keepdim=True)
-        explained &= endless.any(-1, keepdim=True)
-    return first, counts, explained
+        endless = intersected & (hits.m_first - counts[:, : len(layout.mpis)] < 0) & (frames.last_disparities == 0)
+        fully_covered &= (intersected & (entry * layout.content_near >= 1)).any(-1, keepdim=True)
+        fully_covered &= endless.any(-1, keepdim=True)
+    return first, counts, fully_covered
 
 
 # Sample --------------------------------------------------------------------------------------------------------------
 
 
-def _live_samples(
+def _intersected_samples(
     layout: SceneLayout,
     tables: Tables,
     rays: Rays,
@@ -264,4 +265,4 @@ def prune(
 
 
 march.on_cpu(march_on_cpu)
-show_rays.on_cpu(show_rays_on_cpu)
+render_fused.on_cpu(render_fused_on_cpu)

@@ -18,7 +18,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
-from mmpi_ns.utils.errors import say
+from mmpi_ns.utils.errors import log
 
 Route = Literal["auto", "torch", "native"]
 Shading = Literal["ray", "sample"]
@@ -241,7 +241,7 @@ class MMPITrainerConfig(TrainerConfig):
 
     def print_to_terminal(self) -> None:
         """Prints the path of config.yml in place of all settings, which would fill the terminal."""
-        say(f"All settings of this run: {self.get_base_dir() / 'config.yml'}")
+        log(f"All settings of this run: {self.get_base_dir() / 'config.yml'}")
 
     def save_config(self) -> None:
         """Checks the options, locks the run's folder, and writes config.yml (``training/options.py``)."""

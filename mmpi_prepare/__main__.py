@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 
-from mmpi_ns.scripts.command import say_version
+from mmpi_ns.scripts.command import print_version
 
 INTERRUPTED = "mmpi-prepare: interrupted; the same command continues from here."
 KILLED = "mmpi-prepare: ended by {}, perhaps as memory or the disk is full; the same command continues from here."
@@ -44,14 +44,14 @@ def end_at_once_on_signals() -> None:
 
 def entrypoint() -> None:
     """The command ``mmpi-prepare``; exit status 1 without a scene, 3 with a doubtful one."""
-    say_version("mmpi-prepare")
+    print_version("mmpi-prepare")
     end_at_once_on_signals()
     # Before pycolmap is loaded: it has threads of its own, and each of them would start as many again for its matrices.
     for library in ("OMP", "OPENBLAS"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     import tyro
 
-    from mmpi_ns.utils.errors import InputError, say, used_up
+    from mmpi_ns.utils.errors import InputError, log, used_up
     from mmpi_prepare.settings import Settings
 
     settings = tyro.cli(Settings, description=Settings.__doc__)
@@ -63,7 +63,7 @@ def entrypoint() -> None:
         says = error if isinstance(error, InputError) else used_up(error)
         if says is None:
             raise
-        say(f"mmpi-prepare: {says}", "bold red")
+        log(f"mmpi-prepare: {says}", "bold red")
         sys.exit(1)
     sys.exit(0 if verdict.grade == "right" else 3)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mmpi_ns.utils.errors import InputError, progress, say
+from mmpi_ns.utils.errors import InputError, log, progress
 from mmpi_prepare.gps import Array, Fit
 from mmpi_priors.sfm import MIN_ANGLE, triangulate_points, verified_matches
 from mmpi_priors.upright import level_up
@@ -153,7 +153,7 @@ def polish(
             fate = "kept" if after < share * before else "not kept"
             if fate == "kept" and any(turns_back(trial.cameras[n]) for n in several if kind):
                 fate = "not kept, as the lens would turn back before the corner"
-            say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {fate}.")
+            log(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {fate}.")
             if fate == "kept":
                 light, center, chosen = trial, center or not kind, (kind, focal) if kind else chosen
                 start = start if kind else trial
@@ -256,7 +256,7 @@ def open_focals(model: pycolmap.Reconstruction, database: Path, threads: int) ->
     is_open = free > NOTED_WORTH * held
     focals = ", ".join(f"{focal:.0f}" for _, focal in sorted(noted.items())[:3])
     fate = "kept, as the images hardly determine it" if is_open else "not kept"
-    say(f"Lens: {free:.3f} px, {held:.3f} px with the focal length of EXIF ({focals} px): {fate}.")
+    log(f"Lens: {free:.3f} px, {held:.3f} px with the focal length of EXIF ({focals} px): {fate}.")
     return noted if is_open else {}
 
 
@@ -302,7 +302,7 @@ def map_known_poses(
             f"; refined, {model.compute_mean_reprojection_error():.2f} px; poses moved by {moved.mean():.3g} units (at "
             f"most {moved.max():.3g}) and turned by {turned.mean():.2f} degrees (at most {turned.max():.2f})"
         )
-    say(says)
+    log(says)
     return model, says
 
 

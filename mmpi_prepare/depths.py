@@ -15,7 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.utils.errors import InputError, brief, progress, say
+from mmpi_ns.utils.errors import InputError, brief, log, progress
 from mmpi_ns.utils.files import whole
 from mmpi_prepare.images import Photo, in_short
 from mmpi_prepare.poses import KIND
@@ -53,7 +53,7 @@ def find_depths(folder: Path, photos: Sequence[Photo]) -> dict[str, Path]:
             found |= {photo.name: folder / times[nearest]} if abs(nearest - float(names[1])) <= LAG else {}
     missing = [p.name for p in photos if p.name not in found]
     if missing and times and len(found) > len(missing):
-        say(f"{len(missing)} images have no depths within {LAG} s: left out ({in_short(missing)}).", "yellow")
+        log(f"{len(missing)} images have no depths within {LAG} s: left out ({in_short(missing)}).", "yellow")
     elif missing:
         raise InputError(
             f"--depths {folder} has no depth image for {len(missing)} of {len(photos)} images ({in_short(missing)}): "

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.ExifTags import GPS
 
-from mmpi_ns.utils.errors import say
+from mmpi_ns.utils.errors import log
 from mmpi_priors.upright import level_up
 
 RADIUS, SQUARED = 6_378_137.0, 0.00669438
@@ -113,7 +113,7 @@ def find_fit(poses: Array, places: Sequence[Place | None]) -> Fit | None:
     centers, metres = poses[noted, :3, 3], in_metres(np.array([places[i] for i in noted], np.float64))
     count = len(np.unique(metres[:, :2].round(1), axis=0))
     if count < LEAST or len(noted) < SHARE * len(poses):
-        say(f"GPS of {len(noted)} photos at {count} places is too little for metres.")
+        log(f"GPS of {len(noted)} photos at {count} places is too little for metres.")
         return None
     level, _ = level_up(poses[:, :3, 0], -poses[:, :3, 1])
     plane = np.linalg.svd(level[None])[2][1:]  # two axes across up, as east and north are
@@ -127,10 +127,10 @@ def find_fit(poses: Array, places: Sequence[Place | None]) -> Fit | None:
     error = float(np.median(errors))
     extent = scale * float(np.ptp(centers @ np.linalg.svd(centers - centers.mean(0))[2][0]))
     if error > AGREES * extent:
-        say(f"Metres are not known: GPS of {len(noted)} photos differs by {error:.1f} m from a path of {extent:.0f}.")
+        log(f"Metres are not known: GPS of {len(noted)} photos differs by {error:.1f} m from a path of {extent:.0f}.")
         return None
     kept = np.count_nonzero(errors <= OFF * max(error, 1e-9))
     number = f"{kept}" if kept == len(noted) else f"{kept} of {len(noted)}"
     says = f"GPS of {number} photos: they agree to {error:.1f} m of {extent:.0f}"
-    say(f"{what} from {says}.")
+    log(f"{what} from {says}.")
     return Fit(scale, up, says)

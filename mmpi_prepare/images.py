@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from mmpi_ns.data.exif import kept_tags, positive_number, tags_of
-from mmpi_ns.utils.errors import InputError, progress, say
+from mmpi_ns.utils.errors import InputError, log, progress
 from mmpi_ns.utils.files import opened, whole, write_text
 from mmpi_prepare.gps import Place, place_of
 
@@ -84,7 +84,7 @@ def find_images(folder: Path) -> list[Path]:
             why = "are not read: pip install pillow-heif, and start again"
         elif kind in IMAGES:
             why = "are in subfolders and left out, because the folder has images of its own"
-        say(f"{len(names)} {kind} files {why} ({in_short(names)}).", "yellow")
+        log(f"{len(names)} {kind} files {why} ({in_short(names)}).", "yellow")
     if len(images) < 2:
         count = "no image" if not images else f"one image only ({images[0].name})"
         raise InputError(
@@ -181,7 +181,7 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     if not count:
         raise InputError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
     if count < len(photos):
-        say(f"{len(photos) - count} of {len(photos)} images have no mask: all their pixels are used.", "yellow")
+        log(f"{len(photos) - count} of {len(photos)} images have no mask: all their pixels are used.", "yellow")
     return count
 
 
@@ -198,18 +198,18 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     """Writes the chosen frames of a video to ``target/images``. Raises InputError if it cannot be read, or shows no
     motion."""
     (target / "images").mkdir(parents=True, exist_ok=True)
-    log = target / "measured.json"
-    if not log.exists():
-        write_text(log, json.dumps(measure(video)))
-    motion, sharp = np.array(json.loads(log.read_text(encoding="utf-8")))
+    file = target / "measured.json"
+    if not file.exists():
+        write_text(file, json.dumps(measure(video)))
+    motion, sharp = np.array(json.loads(file.read_text(encoding="utf-8")))
     chosen, used = choose_frames(motion, sharp, max_frames, step)
     frames = len(motion)
     if len(chosen) < 2:
         raise InputError(f"{video} shows no motion in {frames} frames: there is no second view.")
-    say(f"{len(chosen)} of {frames} frames taken: the sharpest for every {used:.1%} of the width of motion.")
+    log(f"{len(chosen)} of {frames} frames taken: the sharpest for every {used:.1%} of the width of motion.")
     if used > MOST_MOTION:
         remedy = f"raise --max-frames above {max_frames} or cut the video into shorter ones"
-        say(f"{used:.0%} of the width between frames is much: {remedy}.", "yellow")
+        log(f"{used:.0%} of the width between frames is much: {remedy}.", "yellow")
     capture, photos = cv2.VideoCapture(str(video)), []
     with progress("Writing frames", len(chosen)) as advance:
         for index in range(chosen[-1] + 1):
@@ -256,7 +256,7 @@ def measure(video: Path) -> tuple[list[float], list[float]]:
     if not motion:
         raise InputError(f"{video} holds no frame that can be read: it is damaged, or its codec is unknown here.")
     if total and len(motion) < 0.9 * total:
-        say(f"{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.", "yellow")
+        log(f"{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.", "yellow")
     return motion, sharp
 
 

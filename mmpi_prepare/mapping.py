@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pycolmap
 
-from mmpi_ns.utils.errors import InputError, brief, progress, say
+from mmpi_ns.utils.errors import InputError, brief, log, progress
 from mmpi_prepare.adjustment import STILL, is_bent, open_focals, polish, quality, with_all_points, with_focals
 from mmpi_prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_prepare.features import matching_pairs
@@ -133,7 +133,7 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
         size = result[0].num_reg_images() if result else 0
         tried.append(f"{attempt.name} {size}")
         says = f", {result[0].compute_mean_reprojection_error():.2f} px" if result else ""
-        say(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
+        log(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
         if result and (best is None or quality(result[0]) > quality(best[0])):
             best, chosen = result, attempt.name
         if result and size >= ENOUGH * total and not is_bent(result[0]):
@@ -168,7 +168,7 @@ def _run(
         options.snapshot_path, options.snapshot_frames_freq = folder / "snapshots", SNAPSHOT
         before = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
         if before:
-            say(f"Mapping, {attempt.name}: goes on from {before} images.")
+            log(f"Mapping, {attempt.name}: goes on from {before} images.")
         with progress(f"Mapping, {attempt.name}", total) as advance:
             advance(before)
             models = pycolmap.incremental_mapping(
@@ -262,7 +262,7 @@ def _evidence(name: str, says: str, model: pycolmap.Reconstruction, task: Task) 
     try:
         return witness_of(name, says, model, task.database, task.offered)
     except (ArithmeticError, ValueError, RuntimeError) as error:  # numpy's LinAlgError is a ValueError
-        say(f"Mapping, {name}: left out, its model cannot be judged ({brief(error)}).", "yellow")
+        log(f"Mapping, {name}: left out, its model cannot be judged ({brief(error)}).", "yellow")
         return None
 
 
@@ -291,7 +291,7 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
     polished = _evidence(chosen.name, chosen.says, model, task)
     grades = [ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished) if w is not None]
     if polished is None or grades[1] > grades[0]:
-        say("The final bundle adjustment makes the evidence worse: left out.", "yellow")
+        log("The final bundle adjustment makes the evidence worse: left out.", "yellow")
     else:
         chosen = polished
     verdict = judge_together(chosen, others, task.is_ordered, before)
@@ -385,7 +385,7 @@ def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[st
     candidates = []
     for (name, _), model in zip(starts, models, strict=True):
         if model is None:
-            say(f"Mapping, {name}: no model.")
+            log(f"Mapping, {name}: no model.")
             continue
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
         error = model.compute_mean_reprojection_error()
@@ -397,5 +397,5 @@ def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[st
             says += "; left out, as hardly any match became a point"
         else:
             candidates.append(witness)
-        say(f"Mapping, {name}: {says}.")
+        log(f"Mapping, {name}: {says}.")
     return candidates

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mmpi_ns.data.exif import kept_tags
-from mmpi_ns.utils.errors import InputError, progress, say
+from mmpi_ns.utils.errors import InputError, log, progress
 from mmpi_ns.utils.files import opened, whole
 from mmpi_prepare.export import Split, split_images
 from mmpi_prepare.images import QUALITY, Photo, in_short
@@ -73,7 +73,7 @@ def cut(images: Path, photos: Sequence[Photo], masks: Path | None, target: Path)
     (``NAME.png``) to ``target/masks``; nothing of other images."""
     if not are_panoramas(images, photos):
         return []
-    say(f"{len(photos)} panoramas, each cut into {len(FACES)} faces ({', '.join(FACES)}); what is below is left out.")
+    log(f"{len(photos)} panoramas, each cut into {len(FACES)} faces ({', '.join(FACES)}); what is below is left out.")
     side = photos[0].width // 8 * 2  # as many pixels as what the faces show has in the panorama
     places = _places(photos[0].width, photos[0].height, side)
     with progress("Cutting panoramas", len(photos)) as advance:

@@ -19,7 +19,7 @@ import pycolmap
 from filelock import FileLock, Timeout
 from scipy.cluster.hierarchy import DisjointSet
 
-from mmpi_ns.utils.errors import FULL, InputError, looked_at, progress, quoted, say
+from mmpi_ns.utils.errors import FULL, InputError, log, looked_at, progress, quoted
 from mmpi_ns.utils.files import whole, write_text
 from mmpi_ns.utils.values import check_options
 from mmpi_prepare import checks, export, features, images, panoramas
@@ -71,7 +71,7 @@ class Preparation:
         poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
         source = [s.matching, s.overlap, poses]
         folder, self.matching = self._stage("matches", source, partial(self._match, folder / features.DATABASE))
-        say(f"Matching: {self.matching}.")
+        log(f"Matching: {self.matching}.")
         names = [p.name for p in self.photos]
         self.is_ordered = self.is_video or features.are_in_order(folder / features.DATABASE, names)
         source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
@@ -110,7 +110,7 @@ class Preparation:
             state = {"key": self.key}
             write_text(stamp, json.dumps(state))
         if "result" in state:
-            say(f"{name}: done before", "dim")
+            log(f"{name}: done before", "dim")
         else:
             folder.mkdir(exist_ok=True)
             state["result"] = make(folder)
@@ -270,7 +270,7 @@ class Preparation:
         export.write_images(folder, masks, photos, built, s.downscales)
         depths = write_depths(self.depths, photos, scale / metres, built, s.downscales) if self.depths else {}
         if depths:
-            say(f"Depths: {told}; a metre is {scale / metres:.4g} units of the scene.")
+            log(f"Depths: {told}; a metre is {scale / metres:.4g} units of the scene.")
         notes = {"unit": unit, "up": up, "mapping": says, "matching": self.matching}
         (built / "colmap/sparse/0").mkdir(parents=True)
         model.write(built / "colmap/sparse/0")
@@ -342,7 +342,7 @@ class Preparation:
             return findings, None, "not known" if doubt else "nothing is seen to move"
         moving, fate = sum(moves.values()) / len(split.train), "are masked" if s.moving == "mask" else "move"
         says = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
-        say(f"What moves: {says}; report/moving.jpg shows them.")
+        log(f"What moves: {says}; report/moving.jpg shows them.")
         if s.moving == "mask":
             return findings, target, says
         words = "of the image moves: mask it (--moving mask, or --masks)"
@@ -356,20 +356,20 @@ class Preparation:
         aside = scene / next(f"previous-{i}" for i in range(1, 10_000) if not (scene / f"previous-{i}").exists())
         export.publish(self.work / "scene", scene, aside)
         if aside.exists():
-            say(f"What {scene} held is in {aside}.")
+            log(f"What {scene} held is in {aside}.")
         if not self.settings.keep_work:
             shutil.rmtree(self.work)
         for line in warnings:
-            say(line, "yellow")
+            log(line, "yellow")
         is_right = verdict.grade == "right"
         if not is_right:
-            say(f"This scene is {verdict.grade}: {verdict.says} {self._remedy()}", "bold red")
-        say(
+            log(f"This scene is {verdict.grade}: {verdict.says} {self._remedy()}", "bold red")
+        log(
             f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
             f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
             "bold red" if not is_right else "" if warnings else "green",
         )
-        say(f"ns-train mmpi --data {quoted(scene)}")
+        log(f"ns-train mmpi --data {quoted(scene)}")
 
 
 @contextmanager

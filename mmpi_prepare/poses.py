@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.data.checks import MAP_COORDINATES
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import InputError, log
 from mmpi_prepare.adjustment import Array, camera_poses, nearest_rotation
 from mmpi_prepare.images import IMAGES, Photo, natural_key
 from mmpi_priors.conventions import Matches, find_convention, in_words
@@ -139,7 +139,7 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
     if len(poses) < 2:
         raise InputError(f"--poses {path} has finite poses for {len(poses)} images: at least two are needed.")
     if len(poses) < len(photos):
-        say(f"{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.", "yellow")
+        log(f"{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.", "yellow")
     centers = np.array([pose[:3, 3] for pose in poses.values()])
     if np.abs(centers).max() > MAP_COORDINATES * np.ptp(centers, axis=0).max() > 0:
         origin = np.round(centers.mean(0))
@@ -169,7 +169,7 @@ def agreeing(known: KnownPoses, model: pycolmap.Reconstruction, database: Path) 
         if is_wrong:
             raise InputError(f"The intrinsics contradict the images. {says} Give --focal or --camera.")
         return known
-    say(says, "yellow")
+    log(says, "yellow")
     return replace(known, poses=dict(zip(names, better.applied(matrices), strict=True)), says=f"{known.says}. {says}")
 
 

@@ -18,7 +18,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
-from mmpi_ns.data.checks import say_once
+from mmpi_ns.data.checks import log_once
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_priors.views import Map, project
@@ -68,10 +68,10 @@ def read_ply(path: Path) -> Array | None:
         xyz = np.stack([np.asarray(points[name], dtype=np.float64) for name in "xyz"], -1)
     except (PlyParseError, KeyError, ValueError, TypeError, OSError, MemoryError) as error:
         says = f"{path} is not a PLY file of points ({error}): write it again."
-        say_once(f"[bold yellow]{says} Training goes on without the point cloud.")
+        log_once(f"[bold yellow]{says} Training goes on without the point cloud.")
         return None
     if not len(xyz):
-        say_once(f"[bold yellow]The point cloud {path} holds no point: training goes on without it.")
+        log_once(f"[bold yellow]The point cloud {path} holds no point: training goes on without it.")
         return None
     return xyz
 
@@ -90,7 +90,7 @@ def usable_points(points: Array, centers: Array) -> Array:
     with np.errstate(invalid="ignore"):
         usable = np.abs(points - middle).max(-1) < (FARTHEST * extent or np.inf)
     if not usable.all():
-        say_once(
+        log_once(
             f"{(~usable).sum():,} of {len(usable):,} points of the point cloud are not used: they are no finite "
             "numbers, or absurdly far away."
         )

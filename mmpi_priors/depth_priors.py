@@ -19,13 +19,13 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from rich.progress import track
 
-from mmpi_ns.data.copies import shown_size, size_of
+from mmpi_ns.data.copies import size_as_read, size_of
 from mmpi_ns.data.dataset import MMPIDataset, read_depth_image
 from mmpi_ns.data.posed_images import PosedImages, at_full_size, posed_images
 from mmpi_ns.data.priors import UNKNOWN, Codes, DepthPriors, packed, unpacked
 from mmpi_ns.data.rays import Rays
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.utils.errors import duration, say
+from mmpi_ns.utils.errors import duration, log
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order, num_threads
 from mmpi_priors.cache import Computed, digest, kept
@@ -83,7 +83,7 @@ def make_depth_priors(
         seen = cloud.added_to(observations) if cloud.fits else replace(observations, loose=None)
         depths = depths if cloud.fits else _matched_depths(original, posed, seen)
     if cloud is not None:
-        say(cloud.describe())
+        log(cloud.describe())
         seen = drop_masked(seen, dataset)
     depths = with_points(depths, seen)
     if files:
@@ -142,7 +142,7 @@ def with_sensor(depths: DepthPriors, files: list[Path], unit: float, posed: Pose
     def replaced(i: int) -> Codes:
         codes = depths.codes[i]
         shape = codes.shape[0], codes.shape[1]
-        size = shown_size(size_of(posed.files[i]), posed.sizes[i]).astype(int).tolist()
+        size = size_as_read(size_of(posed.files[i]), posed.sizes[i]).astype(int).tolist()
         depth = read_depth_image(files[i], unit)  # along the optical axis
         depth = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
         x, y = straightened(posed, i, shape)

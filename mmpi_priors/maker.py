@@ -17,7 +17,7 @@ from mmpi_ns.data.exif import light_of
 from mmpi_ns.data.posed_images import at_full_size, posed_images
 from mmpi_ns.data.priors import DepthPriors, Gains, Priors, PriorsMaker, SharedPoints
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import InputError, log
 from mmpi_priors.depth_priors import make_depth_priors, of_cells
 from mmpi_priors.moving import moving_masks, share_of_moving
 from mmpi_priors.new_views import find_shared_points
@@ -49,9 +49,9 @@ class CapturePriors(PriorsMaker):
             masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
             movers, is_masked = share_of_moving(masks), any(mask.any() for mask in masks)
             if is_masked or not doubt:
-                say(movers + (" (--pipeline.datamanager.priors.mask-moving False keeps them)." if is_masked else "."))
+                log(movers + (" (--pipeline.datamanager.priors.mask-moving False keeps them)." if is_masked else "."))
             if doubt:
-                say(doubt, "yellow")
+                log(doubt, "yellow")
             if is_masked:
                 dataset.moving = masks
                 observations = drop_masked(observations, dataset)
@@ -78,13 +78,13 @@ class CapturePriors(PriorsMaker):
             return None
         light = np.array([light_of(file) for file in at_full_size(posed).files])
         if np.isfinite(light).all() and np.ptp(np.log(light)) < SAME_LIGHT:
-            say("Exposure: EXIF notes the same for all images.")
+            log("Exposure: EXIF notes the same for all images.")
             return None
         ratios = color_ratios(posed, depths, self.rays, lambda i: image_and_mask(self.dataset, i), self.seed)
         if ratios is None:
             return None
         gains = image_gains(ratios, len(posed.files), light)
-        say(gains.describe())
+        log(gains.describe())
         return gains if gains.matter else None
 
     def _new_views(

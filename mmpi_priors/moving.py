@@ -100,7 +100,7 @@ def find_moving(
     near = [neighbours(images, i, keys) for i in range(len(shots))]
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
     nothing, first = masks.copy(), {}
-    known = float(np.median([share_known(shot) for shot in shots]))
+    known = float(np.median([valid_share(shot) for shot in shots]))
     if known < KNOWN:
         says = (
             f"Nothing is masked, as other images confirm the depths of {known:.0%} of the textured pixels alone: too "
@@ -165,7 +165,7 @@ def key_images(images: PosedImages, points_of: Callable[[int], NDArray[np.float6
     return keys
 
 
-def share_known(shot: Shot) -> float:
+def valid_share(shot: Shot) -> float:
     """Share of the textured pixels of a shot that have a depth; 1 where there is no texture."""
     textured = shot.view.inside & (mean_and_contrast(shot.view.gray)[1] > CONTRAST)
     return float((shot.depth.inverse > 0)[textured].mean()) if textured.any() else 1.0

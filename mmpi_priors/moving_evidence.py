@@ -68,7 +68,7 @@ class Shot:
     def around(self) -> Map:
         """Inverse depth of the nearest pixel with one, 0 where none is near. [h, w]"""
         near = cv2.dilate((self.depth.inverse > 0).astype(np.uint8), np.ones((NEAR, NEAR), np.uint8)) > 0
-        return np.where(near, nearest_known(self.depth.inverse), 0) if near.any() else self.depth.inverse
+        return np.where(near, nearest_valid(self.depth.inverse), 0) if near.any() else self.depth.inverse
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def splat(shot: Shot, other: Shot) -> Map:
     return np.repeat(np.repeat(result, SPARSE, 0), SPARSE, 1)[:height, :width]
 
 
-def nearest_known(inverse: Map) -> Map:
+def nearest_valid(inverse: Map) -> Map:
     """Inverse depth of every pixel, or of the nearest pixel with one. [h, w]"""
     measured = inverse > 0
     _, label = cv2.distanceTransformWithLabels(
@@ -189,7 +189,7 @@ def possible_depths(shot: Shot, others: Sequence[Neighbour]) -> tuple[list[Map],
         behind.append(shot.ground)
     inverse, mine = shot.depth.inverse, [np.full_like(shot.depth.inverse, 1e-9)]
     if inverse.any():
-        mine += [nearest_known(inverse), cv2.dilate(inverse, np.ones((11, 11), np.uint8))]
+        mine += [nearest_valid(inverse), cv2.dilate(inverse, np.ones((11, 11), np.uint8))]
     return mine, behind
 
 

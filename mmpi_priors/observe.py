@@ -18,7 +18,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.data.checks import say_once
+from mmpi_ns.data.checks import log_once
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.posed_images import PosedImages, at_full_size, camera_observations, posed_images
 from mmpi_ns.placement.observations import Array, Observations
@@ -80,7 +80,7 @@ def observe(
             observations = _find_points(observations, dataset, triangulates, check)
         else:
             if observations.loose is not None:
-                say_once("Point cloud: not used, because the SfM tracks record which images see each point.")
+                log_once("Point cloud: not used, because the SfM tracks record which images see each point.")
                 observations = replace(observations, loose=None)
             angles = keypoint_angles(observations, dataset.cameras)
             off = np.median(angles * observations.intrinsics[observations.seen_by, 0])

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.details import Details, DetailView
-from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks, render_windows
+from mmpi_ns.rendering.images import FUSED_RAYS, render_in_chunks, render_windows
 from mmpi_ns.scene.columns import bits_of
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, window_shares
@@ -97,7 +97,7 @@ class BakedScene:
     def image(self, bundle: RayBundle) -> dict[str, Tensor]:
         """Outputs of an image's rays [H, W], as those of the model, with details if there are any."""
         device = bundle.origins.device
-        outputs = render_in_chunks(bundle, SHOWN_RAYS, device, lambda rays: self.render(rays.origins, rays.directions))
+        outputs = render_in_chunks(bundle, FUSED_RAYS, device, lambda rays: self.render(rays.origins, rays.directions))
         if not self.views:
             return outputs
         exposure = outputs["rgb"].new_tensor(self.windows[0][1].exposure)

@@ -23,7 +23,7 @@ from mmpi_ns.scene import geometry
 from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
-from mmpi_show.ops.baked import shade_baked, show_baked
+from mmpi_show.ops.baked import render_baked, shade_baked
 from mmpi_show.scene import CELLS, MOST_CHANNELS, SIDE, BakedMpis, Codes, Shader, brick_numbers
 
 THINNEST = -12.0
@@ -73,7 +73,7 @@ class BakedWindow:
             background: colour of the background; None: the window's.
         """
         rays = Rays(*(x.cpu() for x in (origins, directions, *(bounds or self.unbounded(origins)))))
-        shown = show_baked(self.mpis, rays, self.threshold)
+        shown = render_baked(self.mpis, rays, self.threshold)
         shaded = shade_baked(self.shader, shown.gathered, shown.mass, rays.directions)
         rgb = torch.where(shown.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
         behind = self.background if background is None else background.cpu()
@@ -97,7 +97,7 @@ class BakedWindow:
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
             for o, d in zip(*(x.split(AT_ONCE) for x in view), strict=True):
-                show_baked(self.mpis, Rays(o, d, *self.unbounded(o)), self.threshold, peaks)
+                render_baked(self.mpis, Rays(o, d, *self.unbounded(o)), self.threshold, peaks)
         return peaks
 
     def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:

@@ -205,6 +205,6 @@ CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "march": _marches,
     "total_variation": _variations,
     "gather_taps": _gathers,
-    "show_rays": partial(_marches, shows=True),
+    "render_fused": partial(_marches, shows=True),
 }
 """Arguments for every operation that has a GPU form."""

@@ -28,8 +28,8 @@ def compare(field, rays, threshold, blends=False, least=0.95, ndc=2e-6, inverse_
         assert kept[name].dtype == wanted[name].dtype
         assert (kept[name][~kept["valid"]] == 0).all(), "empty slots are 0"
     assert torch.allclose(*(m["skipped_before"][same, :width][valid] for m in (kept, wanted)), atol=2e-5)
-    assert torch.equal(fast.samples.live, plain.samples.live)
-    assert torch.equal(fast.samples.explained, plain.samples.explained)
+    assert torch.equal(fast.samples.num_intersected, plain.samples.num_intersected)
+    assert torch.equal(fast.samples.fully_covered, plain.samples.fully_covered)
     difference = (fast.samples.dropped_mass - plain.samples.dropped_mass)[same]
     if difference.numel():
         assert difference.min() > -2e-6 and difference.max() < 1.2e-5, "what is not visited counts as dropped"
@@ -42,7 +42,7 @@ def behind_an_opaque_plane_nothing_is_visited_and_a_hundred_thousandth_is_lost()
     field = MMPIField(ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)).eval()
     field.density.data[field.grids[0].rows[: 10 * field.grids[0].height * field.grids[0].width]] = 30.0
     found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
-    assert found.samples.live.item() == 64 and found.samples.valid.sum() == 1
+    assert found.samples.num_intersected.item() == 64 and found.samples.valid.sum() == 1
     assert found.samples.skipped_total.item() == 0 and found.samples.dropped_mass.item() <= 1e-5
     assert found.composite.accumulation.item() == pytest.approx(1, abs=1e-5)
 
@@ -52,7 +52,7 @@ def nothing_is_marched_without_rays_or_samples():
     away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blends=True)
     assert away.samples.valid.sum() == 0 and away.composite.accumulation.item() == 0
     _, samples = sampled(field, bundle(torch.zeros(0, 3), torch.zeros(0, 3)), 1e-3)
-    assert samples.valid.shape[0] == 0 and samples.live.shape == (0,)
+    assert samples.valid.shape[0] == 0 and samples.num_intersected.shape == (0,)
 
 
 # Rays that are hard to march, through a scene in which every distance is a tie ---------------------------------------

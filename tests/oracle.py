@@ -31,14 +31,14 @@ class Crossings:
     roundoff e cannot promise more than a small multiple of e times these.
     """
 
-    live: np.ndarray
+    intersected: np.ndarray
     inverse_t: np.ndarray
     u: np.ndarray
     v: np.ndarray
     size_uv: np.ndarray
     size_q: np.ndarray
     margin: np.ndarray
-    """Distance to the nearest border that decides about ``live``, relative to such a sum."""
+    """Distance to the nearest border that decides about ``intersected``, relative to such a sum."""
 
 
 def in_frame(mpi, origin, direction):
@@ -75,9 +75,9 @@ def crossings(mpi, origin, direction, near=0.0, far=math.inf):
     if far < math.inf:
         tests.append((w * d[2] - ahead / far, w + (1 + w * reach) / far))
     tests.append((np.where(ahead > 0, ahead, np.minimum(ahead, -1e-300)), 1 + w * reach))
-    live = np.all([gap >= 0 for gap, _ in tests], axis=0)
+    intersected = np.all([gap >= 0 for gap, _ in tests], axis=0)
     margin = np.min([np.abs(gap) / size for gap, size in tests], axis=0)
-    return Crossings(live, q, u, v, size_uv, size_q, np.minimum(margin, facing_margin))
+    return Crossings(intersected, q, u, v, size_uv, size_q, np.minimum(margin, facing_margin))
 
 
 def place_in(mpi, origin, direction, inverse_t):

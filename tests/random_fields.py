@@ -137,7 +137,9 @@ class OracleRay:
         for k, mpi in enumerate(plan.mpis):
             found = oracle.crossings(mpi, origin, direction, near, far)
             self.margin = min(self.margin, float(found.margin.min()))
-            self.heads.append([self._sample(k, p, found.inverse_t[p]) for p in np.flatnonzero(found.live).tolist()])
+            self.heads.append(
+                [self._sample(k, p, found.inverse_t[p]) for p in np.flatnonzero(found.intersected).tolist()]
+            )
         if plan.cube is not None:
             sides = [(b - a) / (n - 1) for a, b, n in zip(plan.cube.lower, plan.cube.upper, plan.cube.shape[::-1])]  # noqa: B905
             step = min(sides) / field.samples_per_voxel
@@ -208,7 +210,7 @@ def compare(field, origins, directions, blends=False, heads_of=None, near=0.05, 
             continue
         wanted = ray.render(blends, heads_of(i, ray) if heads_of else None)
         count = len(wanted.samples)
-        assert found.samples.live[i] == count
+        assert found.samples.num_intersected[i] == count
         valid = found.samples.valid[i]
         assert valid.sum() == count and valid[:count].all()
         assert found.samples.heads[i, :count].tolist() == [s.head for s in wanted.samples]

@@ -39,26 +39,26 @@ class Gpu:
     """Folder for a small capture, its training, and gpu.json with all results."""
 
     def main(self) -> None:
-        tell = partial(print, flush=True)
+        write = partial(print, flush=True)
         report: dict[str, Any] = {"environment": environment()}
         for name, value in report["environment"].items():
-            tell(f"{name}: {value}")
+            write(f"{name}: {value}")
         report["device"] = device = "cuda" if torch.cuda.is_available() else "cpu"
         if device == "cpu":
-            tell("torch sees no GPU: the following is measured on this machine's CPU.")
+            write("torch sees no GPU: the following is measured on this machine's CPU.")
         reason = dispatch.fault("Triton" if device == "cuda" else "C++")
         report["timed"] = timed = time_training(device, noise(self.folder / "noise"), (self.folder / "run").resolve())
         step, frame, pixels = timed["step_ms"], timed["frame_ms"], timed["pixels"]
-        tell(f"a step of {RAYS} rays: {step:.1f} ms, {1e3 * RAYS / step:,.0f} rays/s")
-        tell(f"a frame of {pixels} pixels: {frame:.1f} ms, {1e3 / frame:.1f} frames/s")
-        tell(f"memory: {timed['peak_gib']:.2f} GiB")
+        write(f"a step of {RAYS} rays: {step:.1f} ms, {1e3 * RAYS / step:,.0f} rays/s")
+        write(f"a frame of {pixels} pixels: {frame:.1f} ms, {1e3 / frame:.1f} frames/s")
+        write(f"memory: {timed['peak_gib']:.2f} GiB")
         report["well"] = not (reason or timed["differs"])
         if reason:
-            tell(f"Training works in plain torch, several times slower: {reason}.")
+            write(f"Training works in plain torch, several times slower: {reason}.")
         elif timed["differs"]:
-            tell(f"Compiled operations and plain torch differ here: {timed['differs']}. Report it with this output.")
+            write(f"Compiled operations and plain torch differ here: {timed['differs']}. Report it with this output.")
         else:
-            tell(f"All is well: the compiled operations run on this {device} and agree with plain torch.")
+            write(f"All is well: the compiled operations run on this {device} and agree with plain torch.")
         (self.folder / "gpu.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
 
 

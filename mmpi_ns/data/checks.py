@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.utils.errors import InputError, brief, looked_at
 from mmpi_ns.utils.files import opened
-from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
+from mmpi_ns.utils.values import Number, as_text, check_number, check_row, cut
 
 FLOAT64_SAME = 1e-12
 """Cameras of a file closer together than this fraction of their distance from the origin count as one place."""
@@ -96,7 +96,7 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     folder = os.path.realpath(path.parent)
     outside = [n for n in files if not Path(os.path.realpath(path.parent / n)).is_relative_to(folder)]
     if outside:
-        say_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
+        log_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
 
 
 def names_of_copies(folder: Path) -> str:
@@ -105,7 +105,7 @@ def names_of_copies(folder: Path) -> str:
 
 
 @cache
-def say_once(text: str) -> None:
+def log_once(text: str) -> None:
     """Prints a note once."""
     CONSOLE.print(text)
 
@@ -149,7 +149,7 @@ def _check_files(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], fr
             value = frame.get(key, "given")
             if not isinstance(value, str) or not value.strip() or re.search(NO_PATH, value):
                 raise InputError(
-                    f"The {key} of frame number {i + 1} of {path} is {shown(value)}: give the path of a file as text "
+                    f"The {key} of frame number {i + 1} of {path} is {as_text(value)}: give the path of a file as text "
                     "(UTF-8)."
                 )
             if "\\" in value and not (path.parent / value).is_file():
@@ -190,7 +190,7 @@ def _pose(frame: Mapping[str, Any], path: Path) -> NDArray[np.float64]:
     elif np.linalg.det(pose[:3, :3]) < 0:
         wrong = "mirrored (its determinant is negative)"
     elif np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        wrong = f"no pose (its last row is {shown(rows[3])} and not 0, 0, 0, 1), transposed perhaps"
+        wrong = f"no pose (its last row is {as_text(rows[3])} and not 0, 0, 0, 1), transposed perhaps"
     if wrong is not None:
         raise InputError(
             f"The transform_matrix of frame {name} of {path} is {wrong}: give camera to world with OpenGL axes, or "
@@ -207,7 +207,7 @@ def _check_whole_file(
     if "applied_transform" in meta:
         rows = meta["applied_transform"]
         if not isinstance(rows, list) or len(rows) != 3:
-            raise InputError(f"applied_transform of {path} must be 3 rows of 4 numbers, not {shown(rows)}.")
+            raise InputError(f"applied_transform of {path} must be 3 rows of 4 numbers, not {as_text(rows)}.")
         for i, row in enumerate(rows):
             check_row(f"Row {i + 1} of applied_transform of {path}", row, 4, Number(-1e18, 1e18))
         if abs(np.linalg.det(np.array(rows, dtype=np.float64)[:, :3])) < 1e-12:
@@ -217,11 +217,12 @@ def _check_whole_file(
             check_number(f"{key} of {path}", meta[key], Number(0, most, above=True))
     cloud = meta.get("ply_file_path", "given")
     if not isinstance(cloud, str):
-        raise InputError(f"ply_file_path of {path} is {shown(cloud)}: give the path of a PLY file, or leave it out.")
+        raise InputError(f"ply_file_path of {path} is {as_text(cloud)}: give the path of a PLY file, or leave it out.")
     turned = meta.get("orientation_override", "none")
     if turned not in ORIENTATIONS:
         raise InputError(
-            f"orientation_override of {path} is {shown(turned)}: leave it out or give one of {', '.join(ORIENTATIONS)}."
+            f"orientation_override of {path} is {as_text(turned)}: leave it out or give one of "
+            f"{', '.join(ORIENTATIONS)}."
         )
     kind = (lambda name: Path(name).name) if by_name else Path
     names = {kind(frame["file_path"]) for frame in frames}
@@ -237,7 +238,7 @@ def _check_whole_file(
         lost = [x for x in listed if kind(x) not in names]
         if lost:
             raise InputError(
-                f"{shown(lost[0])}, listed in {key} of {path}, is the file_path of no frame ({len(lost)} such in "
+                f"{as_text(lost[0])}, listed in {key} of {path}, is the file_path of no frame ({len(lost)} such in "
                 "all): correct the list."
             )
 
@@ -275,11 +276,11 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
     """Checks the intrinsics of every camera; as in nerfstudio, a value for all frames overrides that of a frame."""
     model = meta.get("camera_model", "OPENCV")
     if not isinstance(model, str) or model not in MODELS:
-        raise InputError(f"The camera_model of {path} is {shown(model)}: give one of {', '.join(MODELS)}.")
+        raise InputError(f"The camera_model of {path} is {as_text(model)}: give one of {', '.join(MODELS)}.")
     other = next((f for f in frames if MODELS.get(str(f.get("camera_model", model))) != MODELS[model]), None)
     if other is not None:
         raise InputError(
-            f"Frame {cut(other['file_path'])} of {path} has the camera_model {shown(other['camera_model'])}, and one "
+            f"Frame {cut(other['file_path'])} of {path} has the camera_model {as_text(other['camera_model'])}, and one "
             f"for the whole file is used ({model}): state it there, and remove frames of other models."
         )
     if meta.get("is_fisheye") is True and MODELS[model] != CameraType.FISHEYE:
@@ -317,7 +318,7 @@ def _check_camera(
     for key in ("w", "h"):
         check_number(f"The {key} of {where}", camera[key], SIDE)
         if camera[key] != int(camera[key]):
-            raise InputError(f"The {key} of {where} must be whole pixels, not {shown(camera[key])}.")
+            raise InputError(f"The {key} of {where} must be whole pixels, not {as_text(camera[key])}.")
     for key, side in (("fl_x", "w"), ("fl_y", "h")):
         check_number(f"The focal length {key} of {where}", camera[key], POSITIVE)
         share, (least, most) = camera[key] / camera[side], FOCAL_SHARES

@@ -35,7 +35,7 @@ def size_of(file: Path) -> NDArray[np.float64]:
         return np.array(image.size, np.float64)
 
 
-def shown_size(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
+def size_as_read(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
     """Width and height of a file of this size according to its camera, which may lack a last row or column, or have
     another size if files are reduced when they are read."""
     return np.where(np.abs(size - camera) <= 1, size, camera)
@@ -68,10 +68,10 @@ def _is_cut(folder: Path) -> bool:
             with suppress(OSError), Image.open(original) as whole, Image.open(file) as copy:
                 width, height = copy.size
                 if (factor * width, factor * height) != whole.size:
-                    gray, shown = whole.convert("L"), np.asarray(copy.convert("L"), float)
+                    gray, reduced_gray = whole.convert("L"), np.asarray(copy.convert("L"), float)
                     cut = gray.crop((0, 0, factor * width, factor * height)).reduce(factor)
                     reduced = gray.resize(copy.size, Image.Resampling.BOX)
-                    errors = [np.square(np.asarray(image, float) - shown).sum() for image in (cut, reduced)]
+                    errors = [np.square(np.asarray(image, float) - reduced_gray).sum() for image in (cut, reduced)]
                     return errors[0] < errors[1]
     return False
 

@@ -19,7 +19,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.data.checks import PARSER_OPTIONS, check_transforms, say_once
+from mmpi_ns.data.checks import PARSER_OPTIONS, check_transforms, log_once
 from mmpi_ns.data.copies import fit_cameras
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.priors import Gains, Priors, PriorsConfig
@@ -27,7 +27,7 @@ from mmpi_ns.data.ray_sources import PixelPool, RaySources, rays_to_keypoints
 from mmpi_ns.data.rays import CameraRays, TrainingRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import InputError, log
 from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import Generators, generator
 from mmpi_ns.utils.values import check_options
@@ -144,7 +144,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             )  # fmt: skip
             has_keypoints = self.config.keypoint_rays > 0 and len(priors.observations.seen_at) > 0
             if not has_keypoints and share == 0:
-                say("No depth priors, from tracks, matches or a sensor: geometry is learned from colours alone.")
+                log("No depth priors, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
 
     @cached_property
@@ -167,9 +167,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if count := len(self._test_images):
             names = (self._test_images.image_filenames, self.train_dataset.image_filenames)
             if shared := len(set(names[0]).intersection(names[1])):
-                say(f"{shared} of {count} test images are training images too: scores say little about new views.")
+                log(f"{shared} of {count} test images are training images too: scores say little about new views.")
             return self._test_images
-        say("The capture has no test images: scores are of training images, not of new views.")
+        log("The capture has no test images: scores are of training images, not of new views.")
         return self.dataset_type(self.train_dataparser_outputs, scale_factor=self.config.camera_res_scale_factor)
 
     def setup_train(self) -> None:
@@ -188,7 +188,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             self.sources = self._read_sources(cameras)
         else:
             self.sources = self._resident if cameras is None else self._resident.of_images(cameras)
-        say_once(self.sources.describe(self.get_train_rays_per_batch()))
+        log_once(self.sources.describe(self.get_train_rays_per_batch()))
 
     def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
         """Pixels, new views and keypoints of all training cameras, or of some; prints if only a subset of the pixels is
@@ -254,8 +254,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         g = generator(self.config.seed, step, "evaluation", "cpu")
         number = int(torch.randint(len(self.eval_dataset), (1,), generator=g))
         data = self.eval_dataset[number]
-        shown = data["mask"][..., 0] if "mask" in data else torch.ones(data["image"].shape[:2], dtype=torch.bool)
-        pixels = shown.nonzero()
+        usable = data["mask"][..., 0] if "mask" in data else torch.ones(data["image"].shape[:2], dtype=torch.bool)
+        pixels = usable.nonzero()
         if not len(pixels):
             raise InputError(f"The mask of {self.eval_dataset.image_filenames[number]} leaves no pixel: correct it.")
         chosen = pixels[torch.randint(len(pixels), (self.config.eval_num_rays_per_batch,), generator=g)]

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from numpy.typing import NDArray
 
-from mmpi_ns.data.copies import shown_size, size_of, whole_of
+from mmpi_ns.data.copies import size_as_read, size_of, whole_of
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.rays import lens_directions
 from mmpi_ns.placement.observations import Observations
@@ -62,7 +62,7 @@ def at_full_size(images: PosedImages) -> PosedImages:
     Raises InputError naming an image file that cannot be read."""
     copies = [size_of(file) for file in images.files]
     files, sizes, scales = zip(*map(whole_of, images.files, copies), strict=True)
-    reduced = np.stack(copies) / [shown_size(*pair) for pair in zip(copies, images.sizes, strict=True)]
+    reduced = np.stack(copies) / [size_as_read(*pair) for pair in zip(copies, images.sizes, strict=True)]
     intrinsics = images.intrinsics * np.tile(scales * reduced, 2)
     return replace(images, files=files, sizes=np.stack(sizes), intrinsics=intrinsics)
 

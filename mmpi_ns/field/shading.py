@@ -119,15 +119,15 @@ class RayShader(Networks):
         """
         mean = gathered / mass.clamp(min=LEAST_MASS)
         encoded = positional_encoding(directions, self.frequencies[0])
-        said = self.run(0, torch.cat([mean, encoded], -1))
-        return accumulation * change_odds(mean[:, :COLORS], said)
+        offset = self.run(0, torch.cat([mean, encoded], -1))
+        return accumulation * change_odds(mean[:, :COLORS], offset)
 
 
-def change_odds(color: Float[Tensor, "R 3"], said: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+def change_odds(color: Float[Tensor, "R 3"], offset: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
     """Colours whose odds c / (1 - c) are multiplied by e^change: sigmoid(logit(c) + change), without the logit.
 
     Black and white need no special case, and gradients do not vanish as with a clipped sum. The change is ``CHANGE``
     times the network output, and bounded, because larger factors would amplify the rounding of the colour.
     """
-    factor = torch.exp(-MOST_CHANGE * torch.tanh(said * (CHANGE / MOST_CHANGE)))
+    factor = torch.exp(-MOST_CHANGE * torch.tanh(offset * (CHANGE / MOST_CHANGE)))
     return color / (color + (1 - color) * factor)

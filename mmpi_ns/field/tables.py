@@ -239,19 +239,19 @@ class TexelTables(Field):
 
     @torch.no_grad()
     def note_use(
-        self, lookup: Lookup, weights: Float[Tensor, "R S"], live: Int[Tensor, "R"], errors: Float[Tensor, "R"]
+        self, lookup: Lookup, weights: Float[Tensor, "R S"], crossings: Int[Tensor, "R"], errors: Float[Tensor, "R"]
     ) -> None:
         """Records the bricks of the samples of a training batch.
 
         Args:
             lookup: of the samples in the tables.
             weights: of the samples.
-            live: number of samples of each ray before pruning.
+            crossings: number of samples of each ray before pruning.
             errors: squared errors of the rays' colours, 0 where a ray has none.
         """
         gain = self.gain if self.num_copies == 0 else None
         note_use(lookup.rows, lookup.taps, lookup.index, weights, errors, self.peak, gain)
-        self.crossings += live.sum()
+        self.crossings += crossings.sum()
 
     @torch.no_grad()
     def release_unused(self, least: float) -> Int[Tensor, "K"] | None:

@@ -27,7 +27,7 @@ from torch import Tensor
 from mmpi_ns.ops import build
 from mmpi_ns.ops.layout import annotated, check_shapes
 from mmpi_ns.settings import Route
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import InputError, log
 
 Form = Literal["reference", "cpu", "gpu"]
 
@@ -215,23 +215,23 @@ def fault(what: Literal["C++", "Triton"], folder: Path = build.OPS) -> str | Non
                 CONSOLE.print(f"Compiling the inner loops of {name} for this processor: half a minute, once.")
             build.library(folder)
         except build.CannotCompile as error:
-            return _say(str(error))
+            return _log_reason(str(error))
         return None
     try:
         version = importlib.import_module("triton").__version__
     except ImportError as error:
-        return _say(f"Triton cannot be imported ({error})")
+        return _log_reason(f"Triton cannot be imported ({error})")
     if tuple(int(n) for n in version.split(".")[:2]) < OLDEST_TRITON:
-        return _say(f"Triton {version} is too old for the GPU's kernels, which need torch 2.5 or newer")
+        return _log_reason(f"Triton {version} is too old for the GPU's kernels, which need torch 2.5 or newer")
     if shutil.which(os.environ.get("CC", "gcc")) is None and shutil.which("clang") is None:
-        return _say("Triton finds no C compiler: install gcc")
+        return _log_reason("Triton finds no C compiler: install gcc")
     headers = Path(sysconfig.get_paths()["include"]) / "Python.h"
     if not headers.is_file():
         package = f"python{sysconfig.get_python_version()}-dev"
-        return _say(f"Triton needs Python's headers, and {headers} is missing: install {package}")
+        return _log_reason(f"Triton needs Python's headers, and {headers} is missing: install {package}")
     return None
 
 
-def _say(reason: str) -> str:
-    say(f"Plain torch instead of the compiled operations, several times slower: {reason}.")
+def _log_reason(reason: str) -> str:
+    log(f"Plain torch instead of the compiled operations, several times slower: {reason}.")
     return reason

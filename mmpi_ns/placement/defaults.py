@@ -5,7 +5,7 @@ from __future__ import annotations
 from mmpi_ns.scene.plan import MOST_PLANES, MOST_TEXELS, MOST_VOXELS
 from mmpi_ns.settings import PlacementConfig
 from mmpi_ns.utils.errors import InputError
-from mmpi_ns.utils.values import Number, check_options, shown
+from mmpi_ns.utils.values import Number, as_text, check_options
 
 STEPS, LEAST_STEPS, RAYS = 4000, 2500, 1024
 """Training steps of a capture of ``FEW`` to ``MANY`` pixels, minimum for one of fewer pixels, and rays of a step:
@@ -58,4 +58,4 @@ def check_placement(config: PlacementConfig, prefix: str) -> None:
     """Raises InputError naming the option, with its prefix on the command line, whose value cannot be used."""
     check_options(config, RANGES, prefix)
     if not config.faces or not set(config.faces) <= set(FACES):
-        raise InputError(f"{prefix}faces must be some of {', '.join(FACES)}, not {shown(config.faces)}.")
+        raise InputError(f"{prefix}faces must be some of {', '.join(FACES)}, not {as_text(config.faces)}.")

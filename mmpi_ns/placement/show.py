@@ -18,8 +18,8 @@ from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import WindowedPlan
 
 COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f")
-SHOWN_POINTS = 6000
-SHOWN_PLANES = 12
+DRAWN_POINTS = 6000
+DRAWN_PLANES = 12
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def draw_plan(path: Path, plan: ScenePlan, observations: Observations, visible: 
     # Far planes are left out: they would shrink everything else to a dot.
     distance = np.linalg.norm(visible.points - observations.centers[visible.cameras], axis=-1)
     points = visible.points[distance < 40 * visible.near]
-    points = (points[:: max(1, len(points) // SHOWN_POINTS)] - middle) @ base.T
+    points = (points[:: max(1, len(points) // DRAWN_POINTS)] - middle) @ base.T
     centers = (observations.centers - middle) @ base.T
     low, high = np.percentile(points, [1, 99], axis=0) if len(points) else (centers.min(0), centers.max(0))
     low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
@@ -148,7 +148,7 @@ def draw_windows(path: Path, windows: WindowedPlan, observations: Observations) 
     centers = (observations.centers - middle) @ map_axes.T
     figure = Figure(figsize=(13, 8), layout="constrained")
     axes = figure.add_subplot(aspect="equal", title="windows, from above", xlabel="forward", ylabel="left")
-    points = (observations.points[:: max(1, len(observations.points) // SHOWN_POINTS)] - middle) @ map_axes.T
+    points = (observations.points[:: max(1, len(observations.points) // DRAWN_POINTS)] - middle) @ map_axes.T
     axes.scatter(*points.T, s=1, c="0.8", linewidths=0)
     for i, window in enumerate(windows.windows):
         color = COLORS[i % len(COLORS)]
@@ -185,8 +185,8 @@ def _draw_mpi(axes: Axes, mpi: MPIPlan, picture: Array, middle: Array, reach: fl
     """Outline of a frustum and some planes up to ``reach``, in a picture of two world axes (rows) about ``middle``."""
     u0, u1, v0, v1 = mpi.extent
     origin = (np.asarray(mpi.origin) - middle) @ picture.T
-    shown = np.linspace(0, 1, min(SHOWN_PLANES, mpi.planes), endpoint=False)
-    depths = mpi.near / (1 - mpi.depth_share * shown)
+    shares = np.linspace(0, 1, min(DRAWN_PLANES, mpi.planes), endpoint=False)
+    depths = mpi.near / (1 - mpi.depth_share * shares)
     end = min(mpi.far, reach)
     depths = np.append(depths[depths < end], end)
     corners = np.array([[u, v, 1.0] for u in (u0, u1) for v in (v0, v1)]) @ np.asarray(mpi.axes) @ picture.T

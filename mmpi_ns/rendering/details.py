@@ -109,10 +109,10 @@ class Details:
             details.append(STRENGTH * total / weight)
         detail = torch.cat(details).view(bundle.origins.shape) * outputs["accumulation"]
         rgb = (outputs["rgb"] + (detail if exposure is None else exposure * detail)).clamp(0, 1)
-        shown = outputs | {"rgb": rgb, "field_rgb": outputs["rgb"]}
+        detailed = outputs | {"rgb": rgb, "field_rgb": outputs["rgb"]}
         if "radiance" in outputs:
-            shown |= {"radiance": outputs["radiance"] + detail, "field_radiance": outputs["radiance"]}
-        return shown
+            detailed |= {"radiance": outputs["radiance"] + detail, "field_radiance": outputs["radiance"]}
+        return detailed
 
 
 def details_of(folder: Path, step: int) -> Details | None:
@@ -146,10 +146,10 @@ def moved_cameras(cameras: Cameras, poses: CameraOptimizer) -> Cameras:
     """Cameras with the refined poses of an optimiser."""
     if poses.config.mode == "off":
         return cameras
-    moves, cameras = poses(list(range(len(cameras)))).detach(), copy(cameras)
+    corrections, cameras = poses(list(range(len(cameras)))).detach(), copy(cameras)
     before = cameras.camera_to_worlds
-    shift = before[..., 3:] + moves[:, :3, 3:]
-    cameras.camera_to_worlds = torch.cat([moves[:, :3, :3] @ before[..., :3], shift], -1)
+    shift = before[..., 3:] + corrections[:, :3, 3:]
+    cameras.camera_to_worlds = torch.cat([corrections[:, :3, :3] @ before[..., :3], shift], -1)
     return cameras
 
 

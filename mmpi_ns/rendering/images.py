@@ -15,7 +15,7 @@ from mmpi_ns.scene.windows import Window, window_shares
 CPU_RAYS = 4096
 """Rays of a chunk whose samples fit the caches of a CPU and stay below the size that the C library returns to the
 system after each use."""
-SHOWN_RAYS = 4 * CPU_RAYS
+FUSED_RAYS = 4 * CPU_RAYS
 """Rays of a chunk on a CPU if images are rendered in one pass without arrays of samples (``ops.march``)."""
 GPU_RAYS = 1 << 20
 """Most rays of a chunk on a GPU: a frame of 1242 x 375, or half of one of 1920 x 1080."""
@@ -31,7 +31,7 @@ def render_windows(
     origins: Float[Tensor, "R 3"],
     windows: tuple[Window, ...],
     render: Callable[[int, Int[Tensor, "P"]], dict[str, Tensor]],
-    shown: int | None = None,
+    only: int | None = None,
     in_memory: Collection[int] = (),
 ) -> dict[str, Tensor]:
     """Outputs of rays from all windows that they start in: colours by shares, depth and winner of the largest share.
@@ -41,12 +41,12 @@ def render_windows(
         windows: the trained ones.
         render: outputs [P, C] of one window, given its index and the numbers of its rays. Called once for each window,
             so that a window is read from disk once at most, however many rays there are.
-        shown: index of the only window to render; None: the windows that the rays start in.
+        only: index of the only window to render; None: the windows that the rays start in.
         in_memory: windows to render first, before the reading of another one evicts them.
     """
     shares = window_shares(origins, windows)
-    if shown is not None:
-        shares = torch.zeros_like(shares).index_fill_(1, torch.tensor([shown], device=shares.device), 1.0)
+    if only is not None:
+        shares = torch.zeros_like(shares).index_fill_(1, torch.tensor([only], device=shares.device), 1.0)
     parts = {}
     for w in sorted((shares > 0).any(0).nonzero()[:, 0].tolist(), key=lambda w: w not in in_memory):
         rays = (shares[:, w] > 0).nonzero()[:, 0]
@@ -74,7 +74,7 @@ def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass:
         A power of two; on a GPU from ``CPU_RAYS`` to ``GPU_RAYS``.
     """
     if device.type != "cuda":
-        return CPU_RAYS if kept_in_one_pass is None else SHOWN_RAYS
+        return CPU_RAYS if kept_in_one_pass is None else FUSED_RAYS
     free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     held = BYTES_PER_SAMPLE * samples_per_ray if kept_in_one_pass is None else BYTES_PER_SLOT * kept_in_one_pass
     fit = int(FREE_SHARE * free / max(held, 1))

@@ -19,7 +19,7 @@ from torchvision.utils import save_image
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering.details import moved_cameras
 from mmpi_ns.settings import MMPIPipelineConfig
-from mmpi_ns.utils.errors import say
+from mmpi_ns.utils.errors import log
 from mmpi_ns.utils.random_draws import generator
 
 REFINED = "refined_"
@@ -65,7 +65,7 @@ class MMPIPipeline(VanillaPipeline):
             means[name] = float(np.mean(each))
             if get_std:
                 means[f"{name}_std"] = float(np.std(each, ddof=1)) if len(each) > 1 else 0.0
-        say(summary(scores))
+        log(summary(scores))
         self.train()
         return means
 
@@ -113,7 +113,7 @@ class MMPIPipeline(VanillaPipeline):
         exposures = model.exposures.factors, model.exposures.falloff
         exposure = manager.maker.exposure_of(manager.observations, *exposures, camera, observed, outputs)
         if exposure is None:
-            say("No training image sees the surfaces of an evaluated one: it is scored at mean exposure.")
+            log("No training image sees the surfaces of an evaluated one: it is scored at mean exposure.")
             return outputs
         exposed = {
             name.replace("radiance", "rgb"): outputs[name] for name in ("radiance", "field_radiance") if name in outputs
@@ -136,8 +136,8 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
     Returns:
         The refined camera, its rotation in degrees, and its translation in scene units.
     """
-    moves: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=model.device)
-    optimizer = torch.optim.Adam(moves.parameters(), lr=RATES[0])
+    adjustment: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=model.device)
+    optimizer = torch.optim.Adam(adjustment.parameters(), lr=RATES[0])
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1 / STEPS))
     rays = image_rays(camera).flatten()
     observed = image.reshape(-1, 3).to(model.device)
@@ -148,7 +148,7 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
             bundle = rays[chosen.to(model.device)]
             bundle.camera_indices = torch.zeros_like(chosen, device=model.device)[:, None]
             with torch.enable_grad():
-                moves.apply_to_raybundle(bundle)
+                adjustment.apply_to_raybundle(bundle)
                 loss = ((model.image_outputs(bundle)["rgb"] - observed[chosen]) ** 2).mean()
             optimizer.zero_grad()
             loss.backward()
@@ -158,9 +158,9 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
         for p in frozen:
             p.requires_grad_(True)
     sizes: dict[str, Any] = {}
-    moves.get_metrics_dict(sizes)
+    adjustment.get_metrics_dict(sizes)
     return (
-        moved_cameras(camera, moves),
+        moved_cameras(camera, adjustment),
         float(sizes["camera_opt_rotation_max"]),
         float(sizes["camera_opt_translation_max"]),
     )

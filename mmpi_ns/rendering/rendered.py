@@ -21,7 +21,7 @@ from mmpi_ns.field.tables import Lookup
 from mmpi_ns.ops.composite import Composite, composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.gather import RaySums
 from mmpi_ns.ops.march import MarchOptions, MergedSamples
-from mmpi_ns.sampler import march, rays_of, show_rays
+from mmpi_ns.sampler import march, rays_of, render_fused
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
@@ -119,8 +119,8 @@ def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, fir
         voxel = max((high - low) / (count - 1) for low, high, count in sides)
         sizes = torch.where(heads == len(plan.mpis), voxel, sizes)
     pixels = sizes[:, None] / (outputs["depth"] * bundle.pixel_area.sqrt())
-    shown = torch.where(outputs["accumulation"] > 0.5, pixels, 0.0)
-    return {"winning_mpi": field.planned_heads(outputs["winning_mpi"]) + first_head, "texel_pixels": shown}
+    drawn = torch.where(outputs["accumulation"] > 0.5, pixels, 0.0)
+    return {"winning_mpi": field.planned_heads(outputs["winning_mpi"]) + first_head, "texel_pixels": drawn}
 
 
 def render_rays(
@@ -156,7 +156,7 @@ def render_rays(
     return RenderedRays(bundle, samples, composite, rgb, sums, lookup)
 
 
-def shown_outputs(
+def render_outputs(
     bundle: RayBundle, field: MMPIField, *, blends: bool, threshold: float, head_mask: Tensor | None
 ) -> dict[str, Tensor]:
     """rgb (without background), accumulation, transmittance, depth, winning head and dropped mass of rays [R, .].
@@ -173,19 +173,19 @@ def shown_outputs(
     options = MarchOptions(threshold, blends=blends)
     if isinstance(field.networks, RayShader) and not torch.is_grad_enabled():
         rays = rays_of(bundle, head_mask)
-        shown = show_rays(field.layout, field.tables, field.features.data, rays, options)
-        rgb = field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions)
-        light, inverse_t, winner, dropped_mass = shown, shown.inverse_t, shown.winner, shown.dropped_mass
+        outputs = render_fused(field.layout, field.tables, field.features.data, rays, options)
+        rgb = field.networks.shade(outputs.gathered, outputs.mass, outputs.accumulation, bundle.directions)
+        composite, inverse_t, winner, dropped_mass = outputs, outputs.inverse_t, outputs.winner, outputs.dropped_mass
     else:
         rendered = render_rays(bundle, field, options, head_mask)
-        rgb, light, samples = rendered.rgb, rendered.composite, rendered.samples
-        inverse_t = median_inverse_distance(light.weights, samples.inverse_t, samples.valid)
-        winner = winning_heads(light.weights, samples.heads, field.plan.num_heads)
+        rgb, composite, samples = rendered.rgb, rendered.composite, rendered.samples
+        inverse_t = median_inverse_distance(composite.weights, samples.inverse_t, samples.valid)
+        winner = winning_heads(composite.weights, samples.heads, field.plan.num_heads)
         dropped_mass = samples.dropped_mass
     return {
         "rgb": rgb,
-        "accumulation": light.accumulation,
-        "transmittance": light.transmittance,
+        "accumulation": composite.accumulation,
+        "transmittance": composite.transmittance,
         "depth": 1 / inverse_t.clamp(min=1 / field.plan.farthest),
         "winning_mpi": winner,
         "dropped_mass": dropped_mass,

@@ -36,7 +36,7 @@ class WindowStore:
     thread, at any line, so work that must be finished is done here."""
     _held: dict[int, MMPIField] = field(default_factory=dict)
     """Windows in memory, the most recently used last."""
-    _alive: WeakValueDictionary[int, MMPIField] = field(default_factory=WeakValueDictionary)
+    _referenced: WeakValueDictionary[int, MMPIField] = field(default_factory=WeakValueDictionary)
     """These, and evicted windows that a thread is still rendering."""
 
     def path(self, window: int) -> Path:
@@ -51,7 +51,7 @@ class WindowStore:
     def forget(self, window: int) -> None:
         """Ignores the file from now on: the window is about to be trained and will be written again."""
         self._held.pop(window, None)
-        self._alive.pop(window, None)
+        self._referenced.pop(window, None)
 
     def save(self, window: int, field: MMPIField) -> None:
         """Writes a finished window atomically. Raises WriteError if the disk is full or cannot be written."""
@@ -73,7 +73,7 @@ class WindowStore:
         return self._thread.submit(self._load, window, device).result()
 
     def _load(self, window: int, device: torch.device) -> MMPIField:
-        field, path = self._alive.get(window), self.path(window)
+        field, path = self._referenced.get(window), self.path(window)
         if field is None:
             if not path.is_file():
                 raise InputError(
@@ -94,7 +94,7 @@ class WindowStore:
                 ) from error
             field = field.to(device).eval()
         self._held.pop(window, None)
-        self._held[window] = self._alive[window] = field
+        self._held[window] = self._referenced[window] = field
         return field
 
     def adopt(self, other: Path, plans: dict[int, ScenePlan]) -> None:

@@ -127,7 +127,7 @@ def plane_hits(
     p = torch.stack([dz * nears + oz, -(dz + oz * inverse_far), bend_u, -bend_u, bend_v, -bend_v])
     q = torch.stack([one, -inverse_far * one, u1 - slope_u, slope_u - u0, v1 - slope_v, slope_v - v0])
 
-    low, high = _live_range(p, q, oz, frames)
+    low, high = _intersected_range(p, q, oz, frames)
     count = torch.where(facing, (high - low + 1).clamp(min=0), torch.zeros_like(high))
     return PlaneHits(
         m_first=high.to(torch.int64),
@@ -139,7 +139,7 @@ def plane_hits(
     )
 
 
-def _live_range(
+def _intersected_range(
     p: Float[Tensor, "C R K"], q: Float[Tensor, "C R K"], oz: Float[Tensor, "R K"], frames: Frames
 ) -> tuple[Float[Tensor, "R K"], Float[Tensor, "R K"]]:
     """Smallest and largest m of a plane with p w <= q for all C conditions (low > high: none)."""
@@ -153,13 +153,13 @@ def _live_range(
     low = torch.minimum(lower.ceil().clamp(min=0), last + 1)
     low, high = torch.where(never, last + 1, low), torch.where(never, torch.full_like(high, -1), high)
 
-    def live(m: Float[Tensor, "R K"]) -> Bool[Tensor, "R K"]:
+    def is_intersected(m: Float[Tensor, "R K"]) -> Bool[Tensor, "R K"]:
         w = sample_disparity(m, step, end)
         return (p * w <= q).all(0) & (w * oz < 1) & (m >= 0) & (m <= last)
 
     # The division may be off by one plane at a border: the half-space test itself decides.
-    high = torch.where(live(high + 1), high + 1, torch.where(live(high), high, high - 1))
-    low = torch.where(live(low - 1), low - 1, torch.where(live(low), low, low + 1))
+    high = torch.where(is_intersected(high + 1), high + 1, torch.where(is_intersected(high), high, high - 1))
+    low = torch.where(is_intersected(low - 1), low - 1, torch.where(is_intersected(low), low, low + 1))
     return low, high
 
 

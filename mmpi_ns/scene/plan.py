@@ -12,7 +12,7 @@ from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import Any
 
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.values import Number, check_number, check_row, check_text, shown
+from mmpi_ns.utils.values import Number, as_text, check_number, check_row, check_text
 
 Vector = tuple[float, float, float]
 
@@ -117,7 +117,7 @@ class ScenePlan:
                     f"The '{name}' (texels) of {where}", getattr(mpi, name), Number(2, MOST_TEXELS, whole=True)
                 )
             if not isinstance(mpi.axes, (list, tuple)) or len(mpi.axes) != 3:
-                raise InputError(f"The 'axes' of {where} must be three rows of three numbers, not {shown(mpi.axes)}.")
+                raise InputError(f"The 'axes' of {where} must be three rows of three numbers, not {as_text(mpi.axes)}.")
             for i, row in enumerate(mpi.axes):
                 check_row(f"Row {i + 1} of the 'axes' of {where}", row, 3, Number(-2, 2))
             dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in mpi.axes for q in mpi.axes]
@@ -134,7 +134,7 @@ class ScenePlan:
             far = mpi.far
             if far != math.inf and not Number(SHALLOWEST * mpi.near, HUGE).holds(far):
                 raise InputError(
-                    f"{where} needs a 'far' beyond its 'near', or null in 'far' for infinity, not {shown(far)}."
+                    f"{where} needs a 'far' beyond its 'near', or null in 'far' for infinity, not {as_text(far)}."
                 )
         if self.cube is not None:
             for name in ("lower", "upper"):
@@ -232,7 +232,7 @@ class ScenePlan:
 
 def _mpi_name(mpi: Any, index: int) -> str:
     name = mpi.get("name") if isinstance(mpi, dict) else getattr(mpi, "name", None)
-    return f"MPI {shown(name)}" if isinstance(name, str) and name else f"MPI number {index + 1}"
+    return f"MPI {as_text(name)}" if isinstance(name, str) and name else f"MPI number {index + 1}"
 
 
 def read_object(text: str) -> dict:
@@ -254,7 +254,7 @@ def check_fields(cls: type, data: Any, where: str) -> None:
     optional = {f.name for f in fields(cls) if f.default is not MISSING}
     unknown, missing = set(data) - names, names - set(data) - optional
     if unknown or missing:
-        wrong = f"lacks {sorted(missing)}" if missing else f"has unknown fields {shown(sorted(unknown))}"
+        wrong = f"lacks {sorted(missing)}" if missing else f"has unknown fields {as_text(sorted(unknown))}"
         raise InputError(f"{where} {wrong}: compare it with docs/placement.md.")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-from mmpi_ns.scripts.command import run, say_version
+from mmpi_ns.scripts.command import print_version, run
 
 COMMANDS = {
     "score": ("mmpi_ns.bench.score", "PSNR, SSIM and LPIPS of test images that any program has rendered."),
@@ -19,7 +19,7 @@ COMMANDS = {
 
 def entrypoint() -> None:
     """The command ``mmpi-bench``; an error is one sentence and exit status 1."""
-    say_version("mmpi-bench")
+    print_version("mmpi-bench")
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name not in COMMANDS:
         print("usage: mmpi-bench COMMAND [OPTIONS] (mmpi-bench COMMAND --help)\n")

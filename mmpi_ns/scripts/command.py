@@ -12,7 +12,7 @@ import tyro
 from mmpi_ns.utils.errors import used_up
 
 
-def say_version(name: str) -> None:
+def print_version(name: str) -> None:
     """Prints the name and the version of pyproject.toml and ends the command if ``--version`` is its first argument."""
     if sys.argv[1:2] == ["--version"]:
         print(f"{name} {version('mmpi-ns')}")
@@ -27,7 +27,7 @@ def run(name: str, command: Any, **how: Any) -> int:
         command: type that tyro builds from the arguments.
         how: for tyro.
     """
-    say_version(name)
+    print_version(name)
     try:
         tyro.cli(command, **{"prog": name, **how}).main()
     except (ValueError, OSError) as error:

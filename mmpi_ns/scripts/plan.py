@@ -14,7 +14,7 @@ import tyro
 from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_for
 from mmpi_ns.scripts.command import run
 from mmpi_ns.settings import PlacementConfig
-from mmpi_ns.utils.errors import InputError, looked_at, quoted, say
+from mmpi_ns.utils.errors import InputError, log, looked_at, quoted
 from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def load_observations(
     config.new_view_share = 0.0
     manager = config.setup(device="cpu", test_mode="inference")
     if not any(Path(file).is_file() for file in manager.train_dataset.image_filenames):
-        say(f"The images of {data} are not there: its cameras and points alone are judged.")
+        log(f"The images of {data} are not there: its cameras and points alone are judged.")
         return manager.observations, manager
     manager = config.setup(device="cpu", test_mode="val")
     return manager.priors.placement, manager

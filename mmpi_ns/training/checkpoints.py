@@ -25,7 +25,7 @@ from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import InputError, brief, quoted
 from mmpi_ns.utils.files import to_text, write_atomically, write_errors
 from mmpi_ns.utils.pages import all_zero
-from mmpi_ns.utils.values import shown
+from mmpi_ns.utils.values import as_text
 
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "rays", "capture"}
 """Keys of every checkpoint of this method."""
@@ -195,5 +195,5 @@ def _difference(theirs: WindowedPlan, ours: WindowedPlan) -> str:
                 there, here = getattr(x, name), getattr(y, name)
                 if there != here:
                     where = (f" of MPI {x.name!r}" if x is not a else "") + (f" in window {w}" if len(ours) > 1 else "")
-                    return f"{name!r}{where}: {shown(there)} there, {shown(here)} here"
+                    return f"{name!r}{where}: {as_text(there)} there, {as_text(here)} here"
     return "other borders of windows"

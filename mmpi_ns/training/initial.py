@@ -105,9 +105,9 @@ def start_from_votes(field: MMPIField, votes: Votes) -> None:
             softplus = -torch.log1p(-alpha) / layout.interval(k)
             raw = softplus + torch.log(-torch.expm1(-softplus))  # the inverse of softplus, without overflow
             field.density.data[rows, 0] = raw - layout.biases[k][plane]
-            shown = surface > 0
-            colors = votes.colors[rows[shown]] / surface[shown, None]
-            field.features.data[rows[shown], :3] = colors.clamp(DARKEST, 1 - DARKEST).logit()
+            has_color = surface > 0
+            colors = votes.colors[rows[has_color]] / surface[has_color, None]
+            field.features.data[rows[has_color], :3] = colors.clamp(DARKEST, 1 - DARKEST).logit()
 
 
 def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:

@@ -107,8 +107,8 @@ def batch_losses(
     Returns:
         Losses by name, and errors without gradients, 0 for keypoint rays.
     """
-    told = rays.bundle
-    assert isinstance(told, TrainingRays)
+    bundle = rays.bundle
+    assert isinstance(bundle, TrainingRays)
     # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
     asked, size, device = len(image), len(rays.bundle) // rays.times, image.device
     every = torch.arange(rays.times * size, device=device).view(rays.times, size)
@@ -117,12 +117,12 @@ def batch_losses(
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)
     # If MPIs train separately and cover a ray only in part, the remaining transmittance is not penalised.
-    background = torch.where(rays.samples.explained[pixels], random, observed)
-    shown = (rays.rgb, rays.sums.mass, rays.sums.first, rays.sums.second, rays.composite.transmittance)
-    colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in shown)
+    background = torch.where(rays.samples.fully_covered[pixels], random, observed)
+    per_ray = (rays.rgb, rays.sums.mass, rays.sums.first, rays.sums.second, rays.composite.transmittance)
+    colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in per_ray)
     rgb = colors + transmittance * background
-    sums = _depth_sums(rays, told, field)
-    exposure = None if told.exposures is None else told.exposures.index_select(0, pixels)
+    sums = _depth_sums(rays, bundle, field)
+    exposure = None if bundle.exposures is None else bundle.exposures.index_select(0, pixels)
     total = {
         "rgb_loss": photometric(rgb, observed, exposure),
         "point_color": weight.point_color * point_color(mass, first, second, observed),
@@ -134,7 +134,7 @@ def batch_losses(
         total["keypoint_depth"] = weight.keypoint_depth * depth_priors(
             sums.mass.index_select(0, keypoints), reached, KEYPOINT_OUTLIERS, reached.sum().clamp(min=1)
         )
-    if told.disparities is not None and weight.depth_priors > 0:
+    if bundle.disparities is not None and weight.depth_priors > 0:
         total["depth_priors"] = (weight.depth_priors * decay) * depth_priors(
             sums.mass.index_select(0, pixels), sums.reached[pixels], DEPTH_OUTLIERS, max(1, len(pixels))
         )
@@ -145,19 +145,19 @@ def batch_losses(
     return total, errors.new_zeros(len(rays.bundle)).index_copy(0, pixels, errors)
 
 
-def _depth_sums(rays: RenderedRays, told: TrainingRays, field: MMPIField) -> DepthSums:
+def _depth_sums(rays: RenderedRays, bundle: TrainingRays, field: MMPIField) -> DepthSums:
     """Depth sums of all rays; the target is a keypoint or the depth prior of a pixel."""
-    samples, targets = rays.samples, told.disparities
-    targets = told.origins.new_zeros(len(told), 2) if targets is None else targets
+    samples, targets = rays.samples, bundle.disparities
+    targets = bundle.origins.new_zeros(len(bundle), 2) if targets is None else targets
     # The spacing of planes in inverse distance: a surface between two is represented by both. Those of the densest MPI
     # count: one with few planes may stand at a camera, where they suffice.
     spacings = [1 / (m.near * max(1, m.planes - 1)) for m in field.plan.mpis]
     least = PLANE_ERROR * min(spacings, default=0.0)
     targets = torch.stack([targets[:, 0], (targets[:, 1] ** 2 + least**2).sqrt().clamp(min=1e-12)], -1)
-    if (keypoints := told.keypoint_disparities) is not None:
+    if (keypoints := bundle.keypoint_disparities) is not None:
         windows = torch.cat([keypoints, KEYPOINT_WIDTH * keypoints], -1)
         targets = torch.where(keypoints > 0, windows, targets)
-    weights, intervals = rays.composite.weights, 1 / samples.live.clamp(min=1).to(rays.rgb)
+    weights, intervals = rays.composite.weights, 1 / samples.num_intersected.clamp(min=1).to(rays.rgb)
     return depth_sums(weights, samples.inverse_t, samples.valid, intervals, targets, field.plan.content_near)
 
 

@@ -14,7 +14,7 @@ from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, SIDE, head_shapes
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
 from mmpi_ns.scene.windows import Window, WindowedPlan
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import InputError, log
 from mmpi_ns.utils.machine import free_memory
 
 GIB = 2**30
@@ -103,7 +103,7 @@ def fit_memory(
                 f"training and {max(0.0, free) / GIB:.1f} GiB are free: give fewer texels, in the plan or with "
                 "--pipeline.model.placement.max-texels."
             )
-        say(
+        log(
             f"{needed / GIB:.1f} GiB would be needed in training and {free / GIB:.1f} are free: texels are made "
             f"larger, {most / 1e6:.3g} M of them a window instead of {plan.texels / 1e6:.3g} M."
         )

@@ -132,14 +132,14 @@ class Schedule:
         return Schedule(phases=phases, **lists, **data)
 
 
-def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, depths_known: bool = False) -> Schedule:
+def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, has_depths: bool = False) -> Schedule:
     """The schedule of a run of ``total_steps`` steps a window.
 
     Args:
         config: phases, growth, rates and release of bricks; nothing is released before surfaces have formed.
         total_steps: all steps of a window.
         windows: windows of a long capture, trained one after the other.
-        depths_known: training starts with surfaces (``initial.py``).
+        has_depths: training starts with surfaces (``initial.py``).
 
     Raises:
         InputError: no step is left for the first phase, growth goes backwards, or rates never fall.
@@ -153,10 +153,10 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, de
     ends = accumulate(lengths.values())
     phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)
     first = phases[0].end
-    doublings = {s: s / SOONER if depths_known else s for s in config.growth_shares}
+    doublings = {s: s / SOONER if has_depths else s for s in config.growth_shares}
     growth = tuple(max(1, round(s * first)) for s in doublings.values())
     rates = float(config.decay_decades), float(config.decay_from)
-    share = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if depths_known else 1.0
+    share = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if has_depths else 1.0
     schedule = Schedule(phases, growth, *rates, windows, growing_share=share)
     release = (
         sorted({round(doublings.get(s, s) * first) for s in config.release_shares}) if config.release_weight > 0 else []

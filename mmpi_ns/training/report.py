@@ -15,7 +15,7 @@ from torch import Tensor
 from mmpi_ns.rendering.metrics import psnr_and_ssim
 from mmpi_ns.rendering.pipeline import MMPIPipeline
 from mmpi_ns.training.phases import Schedule
-from mmpi_ns.utils.errors import duration, quoted, say
+from mmpi_ns.utils.errors import duration, log, quoted
 
 FIRST_LINE, SHARE = 10, 0.025
 """Steps before the first progress line, and fraction of all steps between two."""
@@ -40,9 +40,9 @@ class TrainingLog:
     """First step."""
     end: int
     """Step after the last one."""
-    _said_at: float = 0.0
+    _logged_at: float = 0.0
     """Time of the last line,"""
-    _said: int = 0
+    _logged: int = 0
     """and number of steps at that time."""
     _phase: str = ""
 
@@ -50,21 +50,21 @@ class TrainingLog:
         """Called after each step with its squared colour error; prints if a line is due."""
         done, now = step + 1, monotonic()
         if done - self.first == 1:  # the first step includes compilation
-            self._said_at, self._said = now, done
+            self._logged_at, self._logged = now, done
         window, phase = self.schedule.window_at(step), self.schedule.phase_at(step).name
         where = phase if self.schedule.windows == 1 else f"window {window + 1} of {self.schedule.windows}, {phase}"
-        since, seconds = done - self._said, now - self._said_at
+        since, seconds = done - self._logged, now - self._logged_at
         due = (since >= SHARE * (self.end - self.first) and seconds >= LEAST_SECONDS) or seconds > MOST_SECONDS
         begins = done - self.first == FIRST_LINE or (where != self._phase and self._phase != "")
         if since == 0 or done - self.first < FIRST_LINE or not (due or begins or done == self.end):
             return
         each = seconds / since
         psnr = -10 * math.log10(max(float(rgb_loss.detach()), 1e-12))
-        say(
+        log(
             f"step {done:,} of {self.end:,} | {where} | {self.rays * since / max(seconds, 1e-9):,.0f} rays/s | "
             f"batch PSNR {psnr:.1f} dB | {duration(each * self.remaining(step))} left"
         )
-        self._said_at, self._said, self._phase = now, done, where
+        self._logged_at, self._logged, self._phase = now, done, where
 
     def remaining(self, step: int) -> float:
         """Steps after this one, each counted by its time relative to this step's."""

@@ -32,7 +32,7 @@ from mmpi_ns.utils.files import to_bytes, to_text
 
 @torch.no_grad()
 def keep_frame(
-    moves: Float[Tensor, "M 6"], centers: Float[Tensor, "M 3"], distance: float, scale_is_free: bool
+    corrections: Float[Tensor, "M 6"], centers: Float[Tensor, "M 3"], distance: float, scale_is_free: bool
 ) -> None:
     """Removes from pose corrections, in place, the gauge: the motion of the whole capture that changes no training
     image.
@@ -42,12 +42,12 @@ def keep_frame(
     squares; the remaining corrections give the same images, to second order in the corrections.
 
     Args:
-        moves: shift in scene units and rotation vector of each camera, about the world's axes (nerfstudio's SO3xR3).
+        corrections: shift in scene units and rotation vector of each camera, about world axes (nerfstudio's SO3xR3).
         centers: the cameras' positions before the corrections.
         distance: of the content, scene units; weights rotations by the shift of the content that they cause.
         scale_is_free: no depth measurement fixes the scale of the capture, so a change of scale is removed as well.
     """
-    shifts, turns = moves.double().split(3, -1)
+    shifts, turns = corrections.double().split(3, -1)
     places = centers.to(shifts) + shifts
     places = places - places.mean(0)
     eye = torch.eye(3).to(places).expand(len(places), 3, 3)
@@ -57,10 +57,10 @@ def keep_frame(
     motions = torch.cat([shift, turn], -1)[:, :free]  # of each camera, by each free motion
     weight = motions.new_tensor([1.0] * 3 + [max(distance, 1e-6)] * 3)
     system = (motions * weight).transpose(1, 2).reshape(-1, free)
-    share = torch.linalg.pinv(system.mT @ system, hermitian=True) @ (system.mT @ (moves * weight).flatten())
+    share = torch.linalg.pinv(system.mT @ system, hermitian=True) @ (system.mT @ (corrections * weight).flatten())
     shift, turn = torch.einsum("k,mkc->mc", share, motions).split(3, -1)
     # exp(-turn) exp(turns), by Baker, Campbell and Hausdorff.
-    moves -= torch.cat([shift, turn + torch.linalg.cross(turn, turns) / 2], -1).to(moves)
+    corrections -= torch.cat([shift, turn + torch.linalg.cross(turn, turns) / 2], -1).to(corrections)
 
 
 def move_rays(bundle: RayBundle, poses: CameraOptimizer) -> None:

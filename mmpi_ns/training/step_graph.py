@@ -27,7 +27,7 @@ from mmpi_ns.ops.march import Capacity
 from mmpi_ns.training.agreement import CLOSE, differences, gradients_of
 from mmpi_ns.training.losses import TV_EVERY
 from mmpi_ns.training.touched_adam import TouchedAdam
-from mmpi_ns.utils.errors import brief, say
+from mmpi_ns.utils.errors import brief, log
 from mmpi_ns.utils.random_draws import Generators
 
 MEASURED = 3
@@ -78,7 +78,7 @@ class Results:
     used: Int[Tensor, "2+H"] | None = None
     """Slots of the widest ray, samples of each head, and distinct rows."""
 
-    def told(self) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+    def as_returned(self) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         """As ``Trainer.train_iteration`` returns it."""
         assert self.values is not None
         total, *values = self.values.detach().clone().unbind()
@@ -158,7 +158,7 @@ class StepGraphs:
         recorded.update.replay()
         self.repeated += 1
         self._send(recorded.results)
-        return recorded.results.told()
+        return recorded.results.as_returned()
 
     def _kind(self, step: int) -> Any:
         """Key of the steps that run the same operations on the same memory. Invalidates recordings made before a change
@@ -220,7 +220,7 @@ class StepGraphs:
         results = self._find_gradients(step, None)
         for optimizer in self.optimizers.values():
             optimizer.step()
-        return results.told()
+        return results.as_returned()
 
     # Room --------------------------------------------------------------------------------------------------------
 
@@ -332,4 +332,4 @@ class StepGraphs:
         self._zero_grad()
         for generators in self.generators:
             generators.held.clear()
-        say(f"Steps run one operation at a time, several times slower: {reason}.", "yellow")
+        log(f"Steps run one operation at a time, several times slower: {reason}.", "yellow")

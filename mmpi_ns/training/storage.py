@@ -18,7 +18,7 @@ from mmpi_ns.scene.texels import head_shapes
 from mmpi_ns.training.memory import Work, stored_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.training.reliability import release_untrained
-from mmpi_ns.utils.errors import say
+from mmpi_ns.utils.errors import log
 from mmpi_ns.utils.host import give_back_freed_memory
 
 FORMING = 0.4
@@ -90,7 +90,7 @@ def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any,
             give_back_freed_memory()
             field.grow(factor, tiles)
             give_back_freed_memory()
-            say(f"The number of texels is now {factor:.1f} times the planned one, in the memory of released bricks.")
+            log(f"The number of texels is now {factor:.1f} times the planned one, in the memory of released bricks.")
             return
         factor *= min(0.98, budget / needed)
 
@@ -132,4 +132,4 @@ def copy_finely(
     give_back_freed_memory()
     field.copy_finely(tiles)
     give_back_freed_memory()
-    say(f"{stored:.0%} of the bricks, with {share:.0%} of the errors, have {FINER**2} times as many texels now.")
+    log(f"{stored:.0%} of the bricks, with {share:.0%} of the errors, have {FINER**2} times as many texels now.")

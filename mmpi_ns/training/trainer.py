@@ -42,7 +42,7 @@ from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.report import TrainingLog, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.step_graph import StepGraphs
-from mmpi_ns.utils.errors import InputError, duration, quoted, say
+from mmpi_ns.utils.errors import InputError, duration, log, quoted
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import discard, keep_freed_memory, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
@@ -80,7 +80,7 @@ class MMPITrainer(Trainer):
                 processors = torch.cuda.get_device_properties(self.device).multi_processor_count
                 model_config.rays_times = times = rays_times(processors)
                 manager.train_num_rays_per_batch, manager.keypoint_rays = times * RAYS, times * manager.keypoint_rays
-            self._says_lines, config.logging.local_writer.enable = config.logging.local_writer.enable, False
+            self._logs_lines, config.logging.local_writer.enable = config.logging.local_writer.enable, False
             super().setup(test_mode)
             config.max_num_iterations = self._window_steps
             plan = self._run.progress.windows
@@ -115,23 +115,23 @@ class MMPITrainer(Trainer):
         work = Work(run.field.feature_channels, not run.progress.schedule.is_joint)
         tables = [training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows]
         cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
-        say(manager.describe())
-        say(describe(plan, self._window_steps, tables, [manager.pixel_bytes(c) for c in cameras]))
+        log(manager.describe())
+        log(describe(plan, self._window_steps, tables, [manager.pixel_bytes(c) for c in cameras]))
         if self._follows_capture:
             rays, times = self._manager.config.train_num_rays_per_batch, self.config.pipeline.model.rays_times  # type: ignore[attr-defined]
-            say(
+            log(
                 f"{self._window_steps:,} steps{' a window' if len(plan) > 1 else ''} for its training pixels; "
                 "--max-num-iterations gives others."
                 + (f" {rays:,} rays a step, {times} times the method's, suit this GPU." if times > 1 else "")
             )
         if not str(self.device).startswith("cuda"):
             if num_threads() > 1 and (cores := free_cores()) < num_threads() - 0.5:
-                say(
+                log(
                     f"{num_threads()} threads run and {cores:.1f} cores are free, so they wait for each other: end "
                     f"other programs, or start with OMP_NUM_THREADS={max(1, round(cores))}."
                 )
             if gpu := unused_gpu():
-                say(f"No GPU is used: {gpu}.")
+                log(f"No GPU is used: {gpu}.")
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with rates of the schedule where no other scheduler is configured."""
@@ -164,7 +164,7 @@ class MMPITrainer(Trainer):
             with suppress(InputError):  # damaged ones are made again
                 lacks = lacks and details_of(self.base_dir / DETAILS_FOLDER, self._last_step) is None
             left = "details of its training images are made" if lacks else "nothing to do"
-            say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
+            log(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
             if lacks:
                 self._complete()
             return
@@ -191,7 +191,7 @@ class MMPITrainer(Trainer):
         self.config.max_num_iterations = max(0, end - self._start_step)
         rays = self._manager.get_train_rays_per_batch()
         schedule = self._run.progress.schedule
-        self._log = TrainingLog(schedule, rays, self._start_step, end) if self._says_lines else None
+        self._log = TrainingLog(schedule, rays, self._start_step, end) if self._logs_lines else None
         try:
             with torch_apart(), keep_freed_memory():
                 super().train()
@@ -214,7 +214,7 @@ class MMPITrainer(Trainer):
         if not self._compared and str(self.device).startswith("cuda"):
             self._compared = True
             if differs := self.kernels_differ():
-                say(
+                log(
                     f"Plain torch is used, several times slower: this GPU's kernels differ from it ({differs}).",
                     "yellow",
                 )
@@ -259,10 +259,10 @@ class MMPITrainer(Trainer):
         with signals_go_to(lambda number: _end(number, end)):
             self._write_details(self._last_step)
             if steps := self._last_step + 1 - self._start_step:
-                say(f"Training finished: {steps:,} steps in {duration(monotonic() - self._began)}.")
-            if self._says_lines:
-                say(quick_test(cast(MMPIPipeline, self.pipeline), self._manager.eval_dataset))
-        say(next_commands(self.base_dir))
+                log(f"Training finished: {steps:,} steps in {duration(monotonic() - self._began)}.")
+            if self._logs_lines:
+                log(quick_test(cast(MMPIPipeline, self.pipeline), self._manager.eval_dataset))
+        log(next_commands(self.base_dir))
 
     def _write_details(self, step: int) -> None:
         """Writes the details of the training images, if they are in use, and adds them to images from now on."""
@@ -273,7 +273,7 @@ class MMPITrainer(Trainer):
         images, folder = self._manager.train_dataset, self.base_dir / DETAILS_FOLDER
         cameras = moved_cameras(images.cameras.to(model.device), model.camera_optimizer)
         render = model.get_outputs_for_camera_ray_bundle
-        say(write_details(folder, step, cameras, model.exposures.factors, partial(image_and_mask, images), render))
+        log(write_details(folder, step, cameras, model.exposures.factors, partial(image_and_mask, images), render))
         model.details = details_of(folder, step)
 
     # Checkpoints --------------------------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ def looked_at(path: Path) -> str:
     return str(path) if path.is_absolute() else f"{path} in {Path.cwd()}, from where the path is seen"
 
 
-def say(text: str, style: str = "") -> None:
+def log(text: str, style: str = "") -> None:
     """Prints text without markup or line breaks, so that brackets are kept and commands can be copied."""
     CONSOLE.print(text, style=style, soft_wrap=True, highlight=False, markup=False)
 

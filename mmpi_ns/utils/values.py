@@ -44,13 +44,13 @@ class Number:
 def check_number(what: str, value: Any, number: Number) -> None:
     """Raises InputError where ``value`` is no such number; ``what`` begins the sentence."""
     if not number.holds(value):
-        raise InputError(f"{what} must be {number}, not {shown(value)}.")
+        raise InputError(f"{what} must be {number}, not {as_text(value)}.")
 
 
 def check_row(what: str, row: Any, count: int, number: Number) -> None:
     """Raises InputError where ``row`` does not hold ``count`` such numbers."""
     if not isinstance(row, (list, tuple)) or len(row) != count or not all(number.holds(x) for x in row):
-        raise InputError(f"{what} must be {count} numbers, each {number}, not {shown(row)}.")
+        raise InputError(f"{what} must be {count} numbers, each {number}, not {as_text(row)}.")
 
 
 def check_options(settings: Any, ranges: Mapping[str, Number], prefix: str) -> None:
@@ -70,7 +70,7 @@ def check_options(settings: Any, ranges: Mapping[str, Number], prefix: str) -> N
 def check_text(what: str, value: Any) -> None:
     """Raises InputError where ``value`` is no text, or empty."""
     if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{what} must be text, not {shown(value)}.")
+        raise InputError(f"{what} must be text, not {as_text(value)}.")
 
 
 def cut(text: str, most: int = 120) -> str:
@@ -79,7 +79,7 @@ def cut(text: str, most: int = 120) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
-def shown(value: Any, most: int = 60) -> str:
+def as_text(value: Any, most: int = 60) -> str:
     """A value to quote in a sentence."""
     text = repr(value) if not isinstance(value, int) or abs(value) < 10**most else "a longer number"
     return cut(text, most).replace(". ", " ")

@@ -54,7 +54,7 @@ vec3 details(vec3 direction, float inverse, vec3 radiance) {
 // A colour with details; a ray that ends in the background is marched again for its depth.
 vec3 detailed(vec3 color, vec3 direction, float surface) {
   if (seen == 0 || mass <= 0.0) return color;
-  float opacity = 1.0 - light;
+  float opacity = 1.0 - transmittance;
   if (opacity < 0.9) surface = march(direction, mass);
   return clamp(color + exposure * opacity * details(direction, max(surface, infinity), color / exposure), 0.0, 1.0);
 }

@@ -120,13 +120,13 @@ vec3 ramp(float x) { // dark blue, red, yellow
 vec3 tint(int k) { return 0.55 + 0.45 * cos(6.2832 * (float(k) * 0.381966 + vec3(0.0, 0.33, 0.67))); }
 
 vec4 sums[GROUPS];
-float light, mass, votes[HEADS];
+float transmittance, mass, votes[HEADS];
 
 // Marches a ray. Returns the inverse distance at which it has gathered half of the expected mass; -1 where it never does.
 float march(vec3 direction, float expected) {
   for (int g = 0; g < GROUPS; g++) sums[g] = vec4(0.0);
   float depth = -1.0;
-  light = 1.0, mass = 0.0;
+  transmittance = 1.0, mass = 0.0;
   /*each*/ beginK_(direction); votes[K_] = 0.0;
   /*end*/
   vec2 size = vec2(textureSize(density, 0));
@@ -148,7 +148,7 @@ float march(vec3 direction, float expected) {
     vec2 uv = (vec2(ivec2(brick % per, brick / per) * 8) + 0.5 + place) / size;
     float raw = densityCodes.x + densityCodes.y * 255.0 * textureLod(density, uv, 0.0).r;
     float pass = exp(-interval * (max(raw, 0.0) + log(1.0 + exp(-abs(raw)))));
-    float weight = light * (1.0 - pass);
+    float weight = transmittance * (1.0 - pass);
     if (weight > threshold) {
       GATHER
       mass += weight;
@@ -156,8 +156,8 @@ float march(vec3 direction, float expected) {
       /*each*/ if (h == K_) votes[K_] += weight;
       /*end*/
     }
-    light *= pass;
-    if (is_over(light, OPAQUE_BAKED)) { light = 0.0; break; }
+    transmittance *= pass;
+    if (is_terminated(transmittance, OPAQUE_BAKED)) { transmittance = 0.0; break; }
     /*each*/ if (h == K_) advanceK_();
     /*end*/
   }
@@ -179,8 +179,8 @@ void main() {
     /*each*/ if (votes[K_] > most) { most = votes[K_]; color = tint(K_); }
     /*end*/
   } else {
-    if (mass > 0.0) color = exposure * shade(sums, mass, direction) * (1.0 - light);
-    color = clamp(color + light * background, 0.0, 1.0);
+    if (mass > 0.0) color = exposure * shade(sums, mass, direction) * (1.0 - transmittance);
+    color = clamp(color + transmittance * background, 0.0, 1.0);
     ADD_DETAILS
   }
   pixel = vec4(share * color, share);

@@ -55,7 +55,7 @@ def test_a_sample_of_the_cube_starts_with_the_alpha_asked_for_at_any_sampling_ra
     plan = ScenePlan((make_mpi(axes=((-1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0))),), cube, 0.05, 1.0)
     field = MMPIField(plan, cube_alpha=alpha, samples_per_voxel=per_voxel).eval()
     found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]))
-    assert found.samples.live.item() == 8 * per_voxel  # 2 units of length, 8 voxel sides
+    assert found.samples.num_intersected.item() == 8 * per_voxel  # 2 units of length, 8 voxel sides
     assert found.composite.transmittance.item() == pytest.approx((1 - alpha) ** (8 * per_voxel), rel=1e-5)
 
 
@@ -89,7 +89,7 @@ def test_growing_keeps_the_parameters_and_a_bilinear_field():
     assert field.density.shape == (rows, 1) and field.plan == plan and field.touched.shape == (rows,)
     assert float(field.texel_factor) == 1.0 and [g.width for g in field.grids] == [7, 7, 4]
     fine = render(field, rays)
-    assert (coarse.samples.live > 3).any()
+    assert (coarse.samples.num_intersected > 3).any()
     mpi_only = (coarse.samples.heads < 2).all(1)  # the cube's samples lie closer when it grows
     assert mpi_only.sum() > 5
     assert torch.allclose(coarse.composite.transmittance[mpi_only], fine.composite.transmittance[mpi_only], atol=1e-5)
@@ -121,7 +121,7 @@ def test_released_texels_are_empty_and_the_others_stay_as_they_are(plan):
     field.touched.fill_(0)
     field.release_untouched()
     found = render(field, bundle(*random_rays(plan, 20, seed=0)))
-    assert found.samples.live.max() > 8
+    assert found.samples.num_intersected.max() > 8
     assert found.composite.weights.max() < 1e-6 and found.composite.transmittance.min() > 0.9999
 
 
@@ -279,7 +279,11 @@ def test_a_state_dict_brings_its_own_plan_and_resolution(ours, theirs, factor):
         assert torch.equal(read.state_dict()[name], value), name
     rays = bundle(*random_rays(written.plan, 12, seed=3))
     a, b = (render(f.eval(), rays, blends=theirs > 1) for f in (written, read))
-    assert torch.equal(a.rgb, b.rgb) and torch.equal(a.samples.live, b.samples.live) and a.samples.live.any()
+    assert (
+        torch.equal(a.rgb, b.rgb)
+        and torch.equal(a.samples.num_intersected, b.samples.num_intersected)
+        and a.samples.num_intersected.any()
+    )
 
 
 def test_a_state_dict_without_a_plan_is_refused(plan):

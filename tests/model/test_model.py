@@ -66,7 +66,7 @@ def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file,
         _, losses, metrics = run_step(trainer, phase.start)
         assert {"rgb_loss", "point_color", "entropy", "distortion", "keypoint_depth"} <= set(losses)
         assert all(torch.isfinite(v) and v.ndim == 0 for v in losses.values())
-        assert metrics["live_samples"] > 8 and 0 < metrics["kept_samples"] <= metrics["live_samples"]
+        assert metrics["intersected_samples"] > 8 and 0 < metrics["kept_samples"] <= metrics["intersected_samples"]
         groups = trainer.pipeline.model.get_param_groups()
         assert {k for k in KINDS if groups[k][0].requires_grad} == TRAINS[phase.name] & set(KINDS)
         trainer.optimizers.zero_grad_all()
@@ -123,9 +123,9 @@ def test_the_cube_learns_from_the_first_step_at_the_default_settings(scene, plan
         cube_alpha=config.cube_alpha, sampling__threshold=config.threshold,
     )  # fmt: skip
     rays, losses, _ = run_step(trainer, 0)
-    live = rays.samples.live.sum() - (rays.samples.heads[rays.samples.valid] < 2).sum()
+    intersected = rays.samples.num_intersected.sum() - (rays.samples.heads[rays.samples.valid] < 2).sum()
     kept = (rays.samples.heads[rays.samples.valid] == 2).sum()
-    assert live > 100 and kept > 0.5 * live
+    assert intersected > 100 and kept > 0.5 * intersected
     sum(losses.values()).backward()
     field = trainer.pipeline.model.field
     assert dense_grad(field.density)[field.grids[-1].rows].abs().sum() > 0

@@ -8,6 +8,8 @@ import pytest
 import torch
 from bricked import bricked_field
 from compiled import both, interpreted, normal  # noqa: F401
+from fused import compare as compare_rendered
+from fused import no_rays_give_empty_outputs
 from kernel_cases import CASES, CLOSE, Shapes, differences
 from marches import (
     HARD_RAYS,
@@ -19,8 +21,6 @@ from marches import (
 )
 from random_fields import bundle, random_field, random_rays, sampled
 from random_scenes import dense_grad
-from shows import compare as compare_shown
-from shows import nothing_is_shown_of_nothing
 
 from mmpi_ns import blending
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -32,7 +32,7 @@ from mmpi_ns.scene.texels import BRICK
 
 
 @pytest.mark.parametrize("shapes", [Shapes(), Shapes((1, 9), cube=False, channels=9)], ids=["2 MPIs", "1 and 9 MPIs"])
-@pytest.mark.parametrize("name", sorted(CASES.keys() - {"adam_rows", "march", "show_rays"}))
+@pytest.mark.parametrize("name", sorted(CASES.keys() - {"adam_rows", "march", "render_fused"}))
 def test_kernels_and_their_gradients_are_those_of_the_definitions(name, shapes):
     found = differences(name, "cpu", shapes)
     assert found and max(found) < CLOSE
@@ -108,7 +108,7 @@ def test_adam_on_rows_is_that_of_float64_and_leaves_the_rest_alone(channels, dty
 @pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("threshold", [0.0, 1e-2])
 def test_the_march_keeps_what_the_reference_keeps(monkeypatch, blends, threshold):
-    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at T = 1e-4
     field = random_field(3, True, seed=3, planes=14)
     _, plain = compare(field, bundle(*random_rays(field.plan, 40, seed=1)), threshold, blends)
     valid = plain.samples.valid
@@ -138,7 +138,10 @@ def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monke
     names = list(HARD_RAYS)
     heads = found["heads"][names.index("on the axis")][found["valid"][names.index("on the axis")]]
     assert raw != 0 or (heads == 1).any(), "equal distances: the twin's samples follow the first MPI's"
-    assert fast.samples.live[names.index("along the planes")] == 0 and fast.samples.live[names.index("backwards")] > 0
+    assert (
+        fast.samples.num_intersected[names.index("along the planes")] == 0
+        and fast.samples.num_intersected[names.index("backwards")] > 0
+    )
 
 
 def test_behind_an_opaque_plane_the_march_visits_nothing():
@@ -182,9 +185,9 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
 
 @pytest.mark.parametrize("blends", [True, False])
 def test_pictures_show_what_the_reference_says(monkeypatch, blends):
-    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at T = 1e-4
     field = random_field(3, True, seed=3, planes=14)
-    wanted = compare_shown(field, bundle(*random_rays(field.plan, 20, seed=1)), 1e-2, blends)
+    wanted = compare_rendered(field, bundle(*random_rays(field.plan, 20, seed=1)), 1e-2, blends)
     assert len(wanted.winner.unique()) > 2 and wanted.gathered.abs().amax(0).min() > 0.05
     assert (wanted.dropped_mass > 1e-3).any()
 
@@ -193,10 +196,10 @@ def test_thin_scenes_with_gaps_show_what_the_reference_says(monkeypatch):
     monkeypatch.setattr(gpu, "block_size", lambda wanted, device: 16)  # two programs, of different lengths
     field = bricked_field(0.4)
     rays = bundle(*random_rays(field.plan, 19, seed=1))
-    wanted = compare_shown(field, rays, 1e-3)
+    wanted = compare_rendered(field, rays, 1e-3)
     assert (wanted.transmittance > 0.1).any()
-    compare_shown(field, rays, 1e-3, True)
+    compare_rendered(field, rays, 1e-3, True)
 
 
 def test_rays_that_meet_nothing_and_no_rays_show_nothing():
-    nothing_is_shown_of_nothing()
+    no_rays_give_empty_outputs()

@@ -31,7 +31,7 @@ def found_and_wanted(mpis, origins, directions, near=0.05, far=math.inf):
     mine = [m.valid & (m.heads == k) for k in range(len(mpis))]
     count = torch.stack([x.sum(1) for x in mine], 1)
     first = torch.stack([torch.where(x, number, -1).amax(1) for x in mine], 1)
-    assert torch.equal(m.live, count.sum(1)) and torch.equal(m.explained[:, 0], count.sum(1) > 0)
+    assert torch.equal(m.num_intersected, count.sum(1)) and torch.equal(m.fully_covered[:, 0], count.sum(1) > 0)
     ray, slot = m.valid.nonzero(as_tuple=True)
     head = m.heads[ray, slot]
     w = sample_disparity(number[ray, slot], frames.disparity_steps[head], frames.last_disparities[head])

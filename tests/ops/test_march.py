@@ -19,7 +19,7 @@ from random_fields import bundle, random_field, random_rays, render
 @pytest.mark.parametrize(("num_mpis", "with_cube"), [(1, False), (4, True), (9, False)])
 @pytest.mark.parametrize("threshold", [0.0, 1e-3, 3e-2])
 def test_the_march_keeps_what_the_reference_keeps(monkeypatch, num_mpis, with_cube, blends, threshold):
-    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at T = 1e-4
     field = random_field(num_mpis, with_cube, seed=num_mpis, planes=40)
     rays = bundle(*random_rays(field.plan, 200, seed=1))
     _, plain = compare(field, rays, threshold, blends, least=0.98, ndc=1e-5, inverse_t=1e-4, tau=3e-5)

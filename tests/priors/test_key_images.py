@@ -53,8 +53,8 @@ def test_nothing_is_masked_where_most_depths_are_unknown(monkeypatch, known, is_
     monkeypatch.setattr(moving, "_moves", lambda *_: (np.ones((50, 100), bool), None))
     for name in ("_followed_on", "_outlined"):
         monkeypatch.setattr(moving, name, lambda shots, near, masks, *_: masks)
-    assert moving.share_known(shot) == pytest.approx(known, abs=0.02)
+    assert moving.valid_share(shot) == pytest.approx(known, abs=0.02)
     _, masks, doubt = find_moving(aside(*np.arange(5) * 0.02), lambda i: wall())
     assert all(mask.any() == is_told for mask in masks)
-    said = f"confirm the depths of {moving.share_known(shot):.0%} of the textured pixels alone"
+    said = f"confirm the depths of {moving.valid_share(shot):.0%} of the textured pixels alone"
     assert (said in doubt and "People who walk along may be left in" in doubt) == (not is_told)

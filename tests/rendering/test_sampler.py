@@ -21,11 +21,11 @@ from mmpi_ns.scene.plan import CubePlan, ScenePlan
 def test_oracle_crosses_planes_where_geometry_says():
     mpi = make_mpi(near=1.0, planes=3, extent=(-1.2, 1.2, -1.0, 1.0))  # depths 1, 2, infinity
     found = oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8])
-    assert found.live.tolist() == [False, True, True]
+    assert found.intersected.tolist() == [False, True, True]
     assert found.u.tolist() == pytest.approx([1.5, 1.125, 0.75])
     assert found.inverse_t.tolist() == pytest.approx([1 / 2.5, 1 / 3.75, 0])
-    assert oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8], far=4.0).live.tolist() == [False, True, False]
-    assert oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8], near=3.8).live.tolist() == [False, False, True]
+    assert oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8], far=4.0).intersected.tolist() == [False, True, False]
+    assert oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8], near=3.8).intersected.tolist() == [False, False, True]
 
 
 def test_oracle_renders_two_planes_by_hand():
@@ -105,7 +105,7 @@ def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(thresho
     assert ((part.rgb - whole.rgb).abs() <= dropped + 1e-5).all()
     assert ((part.composite.accumulation - whole.composite.accumulation).abs() <= 1e-5).all()
     assert (dropped > 1e-4).any() and whole.samples.dropped_mass.max() == 0
-    assert torch.equal(part.samples.live, whole.samples.live)
+    assert torch.equal(part.samples.num_intersected, whole.samples.num_intersected)
     kept = part.samples.valid.sum()
     assert kept < whole.samples.valid.sum() and kept > 0
     missing = whole.composite.weights.sum(-1) - part.composite.weights.sum(-1)
@@ -131,7 +131,7 @@ def test_rays_that_meet_nothing_are_empty(plan, blends):
         assert torch.isfinite(found.rgb).all()
         if count:
             assert (found.rgb[0] == 0).all() and found.composite.transmittance[0] == 1
-            assert found.samples.live[0] == 0 and not found.samples.explained[0]
+            assert found.samples.num_intersected[0] == 0 and not found.samples.fully_covered[0]
             assert not found.samples.valid[0].any()
         if count == 2:
             assert found.composite.transmittance[1] < 0.5
@@ -159,7 +159,7 @@ def test_the_plane_at_infinity_is_sampled_where_the_ray_points_and_not_where_it_
         assert found.samples.inverse_t[i, last[i]] == 0
         assert found.samples.ndc[i, last[i]].tolist() == pytest.approx([0.3, -0.4, 1.0], abs=1e-6)
     assert torch.isfinite(found.rgb).all() and found.composite.weights[1, 0] > 0
-    assert render(field, bundle(origins, [direction, direction], far=1e6)).samples.live.tolist() == [8, 0]
+    assert render(field, bundle(origins, [direction, direction], far=1e6)).samples.num_intersected.tolist() == [8, 0]
 
 
 @pytest.mark.parametrize("blends", [True, False])
@@ -170,7 +170,7 @@ def test_a_ray_does_not_depend_on_its_batch(blends, threshold):
     order = np.random.default_rng(0).permutation(60)
     whole = render(field, bundle(origins, directions), threshold, blends)
     shuffled = render(field, bundle(origins[order], directions[order]), threshold, blends)
-    assert torch.equal(whole.samples.live[order], shuffled.samples.live)
+    assert torch.equal(whole.samples.num_intersected[order], shuffled.samples.num_intersected)
     assert torch.allclose(whole.rgb[order], shuffled.rgb, atol=1e-6)
     for size in (1, 7, 59):
         parts = [render(field, bundle(origins[i : i + size], directions[i : i + size]), threshold, blends)
@@ -180,30 +180,30 @@ def test_a_ray_does_not_depend_on_its_batch(blends, threshold):
         assert torch.allclose(whole.samples.dropped_mass, dropped, atol=1e-6)
 
 
-def ray_explained(plan, origin, direction, alone=True):
+def ray_is_covered(plan, origin, direction, alone=True):
     """Alone: all heads of the plan, asked as one of several groups of heads that train apart."""
     mask = torch.ones(1, plan.num_heads, dtype=torch.bool) if alone else None
     rays = bundle([origin], [unit(direction)])
-    return bool(render(MMPIField(plan).eval(), rays, head_mask=mask).samples.explained)
+    return bool(render(MMPIField(plan).eval(), rays, head_mask=mask).samples.fully_covered)
 
 
 def test_a_ray_is_explained_when_it_enters_before_the_first_content_and_stays_to_infinity():
     one = ScenePlan((make_mpi(near=1.0, extent=(-1.0, 1.0, -0.5, 0.5)),), None, 0.05, content_near=1.5)
-    assert ray_explained(one, [0, 0, 0], [0, 0, 1])
-    assert ray_explained(one, [0.4, 0.1, 3.0], [0.5, -0.2, 1]), "starts inside"
-    assert not ray_explained(one, [0, 0, 0], [0, 0, -1]), "meets nothing"
-    assert not ray_explained(one, [0, 0, 1.5], [1.3, 0, 1]), "leaves the frustum before infinity"
-    assert not ray_explained(one, [-10, 0, 0], [0.9, 0, 1]), "enters far behind the first content"
-    assert not ray_explained(one, [0, 0, -3], [0, 0, 1]), "reaches the first plane far behind the first content"
+    assert ray_is_covered(one, [0, 0, 0], [0, 0, 1])
+    assert ray_is_covered(one, [0.4, 0.1, 3.0], [0.5, -0.2, 1]), "starts inside"
+    assert not ray_is_covered(one, [0, 0, 0], [0, 0, -1]), "meets nothing"
+    assert not ray_is_covered(one, [0, 0, 1.5], [1.3, 0, 1]), "leaves the frustum before infinity"
+    assert not ray_is_covered(one, [-10, 0, 0], [0.9, 0, 1]), "enters far behind the first content"
+    assert not ray_is_covered(one, [0, 0, -3], [0, 0, 1]), "reaches the first plane far behind the first content"
 
 
 def test_without_other_heads_all_that_a_ray_shows_is_to_be_explained():
     one = ScenePlan((make_mpi(near=1.0, extent=(-1.0, 1.0, -0.5, 0.5)),), None, 0.05, content_near=1.5)
     partly = [0, 0, 1.5], [1.3, 0, 1]
-    assert ray_explained(one, *partly, alone=False) and not ray_explained(one, *partly)
-    assert not ray_explained(one, [0, 0, 0], [0, 0, -1], alone=False), "meets nothing"
+    assert ray_is_covered(one, *partly, alone=False) and not ray_is_covered(one, *partly)
+    assert not ray_is_covered(one, [0, 0, 0], [0, 0, -1], alone=False), "meets nothing"
     cube = CubePlan((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0), (4, 4, 4))
-    assert ray_explained(ScenePlan((make_mpi(),), cube, 0.05, 1.5), [0, 0, 0], [0, 0, -1], alone=False), "the cube"
+    assert ray_is_covered(ScenePlan((make_mpi(),), cube, 0.05, 1.5), [0, 0, 0], [0, 0, -1], alone=False), "the cube"
 
 
 def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):

@@ -180,7 +180,7 @@ def used(field, rays, least):
     _, samples = sampled(field, rays)
     _, lookup = field.optical_depths(rays, samples)
     weights = render(field, rays).composite.weights
-    field.note_use(lookup, weights, samples.live, weights.new_ones(len(weights)))
+    field.note_use(lookup, weights, samples.num_intersected, weights.new_ones(len(weights)))
     return weights, field.release_unused(least)
 
 
@@ -191,7 +191,7 @@ def test_a_release_changes_images_by_no_more_than_what_it_gives_up():
     weights, kept = used(field, rays, least := 0.02)
     assert kept is not None and 0.1 * bricks < field.num_bricks < 0.9 * bricks
     after = render(field, rays)
-    assert torch.equal(before.samples.live, after.samples.live)
+    assert torch.equal(before.samples.num_intersected, after.samples.num_intersected)
     # Only samples that weigh less than the bound get thinner, so what they weighed is all that others can gain.
     given_up = torch.where(weights < least, weights, 0.0).sum(-1)
     change = (after.rgb - before.rgb).abs().amax(-1)

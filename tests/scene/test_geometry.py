@@ -14,7 +14,7 @@ from mmpi_ns.scene.plan import CubePlan
 F64 = torch.float64
 
 
-def live_planes(mpis, *ray, dtype=F64):
+def intersected_planes(mpis, *ray, dtype=F64):
     """Live plane indices (0 nearest) of the first ray in each MPI."""
     frames = Frames.pack(mpis, dtype=dtype)
     hits = plane_hits(*ray, frames)
@@ -24,7 +24,7 @@ def live_planes(mpis, *ray, dtype=F64):
 
 
 def hit_samples(frames, hits, k):
-    """(ray, plane m, u, v, 1/t) of every live sample of MPI k."""
+    """(ray, plane m, u, v, 1/t) of every intersected sample of MPI k."""
     rows, columns = [], []
     for r in range(hits.count.shape[0]):
         for i in range(int(hits.count[r, k])):
@@ -71,7 +71,7 @@ def test_planes_of_an_mpi_that_ends_stand_at_even_disparities_from_near_to_far()
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_rays_meet_an_mpi_that_ends_before_its_end_only(origin, direction, expected, dtype):
     mpi = make_mpi(near=2.0, far=10.0, planes=5)  # depths 2, 2.5, 10/3, 5, 10
-    assert live_planes([mpi], *rays(origin, direction, dtype=dtype), dtype=dtype) == [expected]
+    assert intersected_planes([mpi], *rays(origin, direction, dtype=dtype), dtype=dtype) == [expected]
 
 
 def test_ndc_spans_near_to_far():
@@ -105,15 +105,15 @@ def test_samples_stay_between_near_and_far():
         (2.5, 3.5, []),
         (1.2, 1.25, []),
     ):
-        assert live_planes([mpi], *rays([0, 0, 0], [0, 0, 1], near, far)) == [expected], (near, far)
+        assert intersected_planes([mpi], *rays([0, 0, 0], [0, 0, 1], near, far)) == [expected], (near, far)
 
 
 def test_plane_at_infinity_is_hit_where_the_direction_points_into_the_frustum():
     mpi = make_mpi(extent=(-1.0, 1.0, -0.5, 0.5))
     far_away = [1e3, 1e3, 0]
-    assert live_planes([mpi], *rays(far_away, [0.99, 0.49, 1])) == [[mpi.planes - 1]]
-    assert live_planes([mpi], *rays(far_away, [1.01, 0.49, 1])) == [[]]
-    assert mpi.planes - 1 not in live_planes([mpi], *rays([0, 0, 0], [0.1, 0, 1], far=1e12))[0]
+    assert intersected_planes([mpi], *rays(far_away, [0.99, 0.49, 1])) == [[mpi.planes - 1]]
+    assert intersected_planes([mpi], *rays(far_away, [1.01, 0.49, 1])) == [[]]
+    assert mpi.planes - 1 not in intersected_planes([mpi], *rays([0, 0, 0], [0.1, 0, 1], far=1e12))[0]
 
 
 def test_points_behind_an_mpi_are_outside_it_and_finite():

@@ -58,11 +58,11 @@ def read_tiles(bundle, plan, near=0.0):
     found = torch.zeros(len(grids[0].tiles), dtype=torch.bool)
     for k, mpi in enumerate(plan.mpis):
         for m in range(mpi.planes):
-            live = (m <= hits.m_first[:, k]) & (m > hits.m_first[:, k] - hits.count[:, k])
+            intersected = (m <= hits.m_first[:, k]) & (m > hits.m_first[:, k] - hits.count[:, k])
             w = sample_disparity(torch.tensor(m), frames.disparity_steps[k], frames.last_disparities[k])
             u0, u1, v0, v1 = mpi.extent
-            u = (hits.u[live, k, 0] + w * hits.u[live, k, 1] - u0) * (2 / (u1 - u0)) - 1
-            v = (hits.v[live, k, 0] + w * hits.v[live, k, 1] - v0) * (2 / (v1 - v0)) - 1
+            u = (hits.u[intersected, k, 0] + w * hits.u[intersected, k, 1] - u0) * (2 / (u1 - u0)) - 1
+            v = (hits.v[intersected, k, 0] + w * hits.v[intersected, k, 1] - v0) * (2 / (v1 - v0)) - 1
             plane = torch.full_like(u, mpi.planes - 1 - m, dtype=torch.int64)
             rows, _ = grids[k].bilinear(plane, torch.stack([u, v], -1))
             found[grids[k].places[rows // BRICK]] = True

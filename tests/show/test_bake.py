@@ -14,7 +14,7 @@ from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
 from mmpi_ns.field.shading import RayShader
-from mmpi_ns.rendering.rendered import bounded, shown_outputs, winners
+from mmpi_ns.rendering.rendered import bounded, render_outputs, winners
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_show import __main__ as export
 from mmpi_show.bake import bake_of_model, bake_run, compare
@@ -92,7 +92,7 @@ def test_finer_copies_are_baked_and_shown_as_parts_of_their_mpis(trainer, monkey
     model.show.value = "all"
     head_mask = (torch.arange(2 * count) % count == 0).expand(len(rays), -1)
     with torch.no_grad():
-        shown = shown_outputs(bounded(rays, field.plan), field, blends=False, threshold=3e-3, head_mask=head_mask)
+        shown = render_outputs(bounded(rays, field.plan), field, blends=False, threshold=3e-3, head_mask=head_mask)
     torch.testing.assert_close(alone["accumulation"], shown["accumulation"])
     torch.testing.assert_close(alone["depth"], shown["depth"])
     assert (alone["depth"] / exact["depth"] - 1).abs().max() > 0.1

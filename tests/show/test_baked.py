@@ -20,9 +20,9 @@ FORMS = ("reference", "cpu")
 
 
 def marched(form, window, rays, peaks=None):
-    if form == "cpu" and dispatch.form_of("show_baked", torch.zeros(1)) != "cpu":
+    if form == "cpu" and dispatch.form_of("render_baked", torch.zeros(1)) != "cpu":
         pytest.skip("no C++ compiler")
-    return dispatch.function("show_baked", form)(window.mpis, Rays(*rays), window.threshold, peaks)
+    return dispatch.function("render_baked", form)(window.mpis, Rays(*rays), window.threshold, peaks)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -60,7 +60,7 @@ def shaded(form, window, found, directions):
 @pytest.mark.parametrize("sizes", [(7, 3), (64, 64, 3), (5, 9, 6, 3)])
 def test_shading_agrees_with_the_reference(octaves, sizes):
     """Any widths and depths, rays in no multiple of sixteen, black and white, and no mass at all."""
-    if dispatch.form_of("show_baked", torch.zeros(1)) != "cpu":
+    if dispatch.form_of("render_baked", torch.zeros(1)) != "cpu":
         pytest.skip("no C++ compiler")
     g = torch.Generator().manual_seed(octaves)
     whole = (5 + 3 * (1 + 2 * octaves), *sizes)

@@ -1,4 +1,4 @@
-"""Stability of the geometry: live planes, their (u, v) and 1/t, positions in other frames, the cube."""
+"""Stability of the geometry: intersected planes, their (u, v) and 1/t, positions in other frames, the cube."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from mmpi_ns.scene.plan import CubePlan, MPIPlan
 ROUNDINGS = 16
 """Of (u, v), 1/t and what decides about a plane: 4 of a rotated offset, 3 of a rotated direction, a quotient of those,
 a product and a sum, 4 of a disparity; docs/stability.md."""
-LIVE = "exactly the live planes but where a border is within 16 roundings; (u, v) and 1/t to 16 roundings"
+RANGE = "exactly the intersected planes but where a border is within 16 roundings; (u, v) and 1/t to 16 roundings"
 Rays = tuple[list[MPIPlan], Array, Array, float, float]
 """MPIs, origins and directions [R, 3], near, far."""
 
@@ -47,11 +47,11 @@ def measure_hits(rays: Callable[[], Rays], precision: Precision) -> Outcome:
         hits = plane_hits(bundle.origins, bundle.directions, bundle.nears, bundle.fars, frames)  # type: ignore[arg-type]
     errors, wrong = [Error(0.0, ROUNDINGS * UNIT)], 0
     for k, mpi in enumerate(mpis):
-        live, u, v, inverse_t = (as_array(x) for x in crossings(hits, frames, k, mpi.planes))
+        intersected, u, v, inverse_t = (as_array(x) for x in crossings(hits, frames, k, mpi.planes))
         for i in range(len(origins)):
             wanted = oracle.crossings(mpi, origins[i], directions[i], near, far)
-            wrong += int((wanted.live != live[i])[wanted.margin > ROUNDINGS * UNIT].sum())
-            both = wanted.live & (live[i] > 0)
+            wrong += int((wanted.intersected != intersected[i])[wanted.margin > ROUNDINGS * UNIT].sum())
+            both = wanted.intersected & (intersected[i] > 0)
             for found, expected, size in (
                 (u, wanted.u, wanted.size_uv),
                 (v, wanted.v, wanted.size_uv),
@@ -183,31 +183,31 @@ def cases() -> list[Case]:
     past = cone + np.linspace(0, 2, 64)[:, None] * [1, 0, 0]
     last = "the plane at infinity alone, 1/t = 0"
     hits: list[tuple[str, str, Callable[[], Rays]]] = [
-        ("12 random MPIs, 200 rays", LIVE, partial(_anywhere, 200, 12)),
-        ("rays parallel to the planes (facing component 0, 1e-7, -1e-9)", "no live plane",
+        ("12 random MPIs, 200 rays", RANGE, partial(_anywhere, 200, 12)),
+        ("rays parallel to the planes (facing component 0, 1e-7, -1e-9)", "no intersected plane",
          partial(_from, [0, 0, 0.5], flat, front((-1e9, 1e9) * 2))),
-        ("rays nearly parallel to the planes (facing component 3e-7 to 0.1)", LIVE, _nearly_parallel),
-        ("rays that point away", "no live plane", partial(_from, [[0, 0, 50], [0, 0, -5]] * 32, -cone)),
-        ("camera on a plane, and 1e-3 before and past it", LIVE, _on_planes),
+        ("rays nearly parallel to the planes (facing component 3e-7 to 0.1)", RANGE, _nearly_parallel),
+        ("rays that point away", "no intersected plane", partial(_from, [[0, 0, 50], [0, 0, -5]] * 32, -cone)),
+        ("camera on a plane, and 1e-3 before and past it", RANGE, _on_planes),
         ("camera past all finite planes (500 units)", last, partial(_from, [0.2, 0.1, 500.0], cone)),
         ("camera 1e6 units ahead of the MPI", last, partial(_from, [3.0, -2.0, 1e6], cone)),
-        ("camera 1e3 units behind the MPI", LIVE, partial(_behind, 1e3)),
-        ("camera 1e6 units behind the MPI", LIVE, partial(_behind, 1e6)),
-        ("camera beside every frustum, looking in and looking past", LIVE, partial(_from, [-10, 0, 0], past)),
-        ("rays along the frustum's border, and one rounding beside it", LIVE, _grazing),
+        ("camera 1e3 units behind the MPI", RANGE, partial(_behind, 1e3)),
+        ("camera 1e6 units behind the MPI", RANGE, partial(_behind, 1e6)),
+        ("camera beside every frustum, looking in and looking past", RANGE, partial(_from, [-10, 0, 0], past)),
+        ("rays along the frustum's border, and one rounding beside it", RANGE, _grazing),
         ("finite far (9 units)", "no plane behind it, none at infinity",
          lambda: (*_anywhere(200, 4, seed=7)[:3], 2.0, 9.0)),
-        ("cameras and MPIs 1e6 units from the world's origin", LIVE, partial(_anywhere, 200, 4, 8.0, 1e6, 8)),
-        ("scene scale 1e-4", LIVE, partial(_anywhere, 300, 4, 1e-4, seed=9)),
-        ("scene scale 1e5", LIVE, partial(_anywhere, 300, 4, 1e5, seed=10)),
-        ("two MPIs turned by 1e-6 and moved by 1e-6 (nearly parallel planes)", LIVE, _nearly_parallel_mpis),
-        ("MPIs that end at 1.5 times their near plane (bricks)", LIVE, partial(_alike, 17, 3, 120, 1.5, planes=24)),
-        ("MPIs that end at 100 times their near plane", LIVE, partial(_alike, 17, 3, 120, 100.0, planes=24)),
-        ("2 planes", LIVE, partial(_alike, 12, 2, 60, planes=2)),
-        ("4,096 planes", LIVE, partial(_alike, 12, 2, 60, planes=4096)),
-        ("a telephoto frustum (tangents +-1e-3)", LIVE,
+        ("cameras and MPIs 1e6 units from the world's origin", RANGE, partial(_anywhere, 200, 4, 8.0, 1e6, 8)),
+        ("scene scale 1e-4", RANGE, partial(_anywhere, 300, 4, 1e-4, seed=9)),
+        ("scene scale 1e5", RANGE, partial(_anywhere, 300, 4, 1e5, seed=10)),
+        ("two MPIs turned by 1e-6 and moved by 1e-6 (nearly parallel planes)", RANGE, _nearly_parallel_mpis),
+        ("MPIs that end at 1.5 times their near plane (bricks)", RANGE, partial(_alike, 17, 3, 120, 1.5, planes=24)),
+        ("MPIs that end at 100 times their near plane", RANGE, partial(_alike, 17, 3, 120, 100.0, planes=24)),
+        ("2 planes", RANGE, partial(_alike, 12, 2, 60, planes=2)),
+        ("4,096 planes", RANGE, partial(_alike, 12, 2, 60, planes=4096)),
+        ("a telephoto frustum (tangents +-1e-3)", RANGE,
          partial(_alike, 13, 2, 100, near=0.01, spread=2.5e-4, planes=24, extent=(-1e-3, 1e-3) * 2)),
-        ("tangents up to 1e3", LIVE,
+        ("tangents up to 1e3", RANGE,
          partial(_alike, 13, 2, 100, near=0.01, spread=0.5, planes=24, extent=(-1e3, 1e3) * 2)),
     ]  # fmt: skip
     places: dict[str, Callable[[], Rays]] = {
@@ -217,7 +217,7 @@ def cases() -> list[Case]:
     }
     placed, inside = "(u, v, s) to 16 roundings, and inside or outside rightly", "exactly the samples inside"
     rows: list[tuple[str, str, Callable[[Precision], Outcome]]] = [
-        ("2,400 random poses: 200 MPIs, 12 rays each", LIVE, _thousands),
+        ("2,400 random poses: 200 MPIs, 12 rays each", RANGE, _thousands),
         *((name, expectation, partial(measure_hits, rays)) for name, expectation, rays in hits),
         *((name, placed, partial(measure_places, rays)) for name, rays in places.items()),
         ("the cube: 300 rays through and past it", inside, partial(measure_cube, 1.0, False)),

@@ -43,7 +43,7 @@ def slow_votes(plan, origins, directions, depths, colors):
             w = oracle.disparities(mpi)
             # The next plane's inverse distance, from the slope of 1/t = w d / (1 - w o) over the disparity w of planes.
             spacings = (w[0] - w[1]) * np.abs(d[2]) / (1 - w * o[2]) ** 2
-            for plane in np.flatnonzero(found.live | (found.margin <= TOO_CLOSE)).tolist():
+            for plane in np.flatnonzero(found.intersected | (found.margin <= TOO_CLOSE)).tolist():
                 x, y = (found.u[plane] - u0) / (u1 - u0), (found.v[plane] - v0) / (v1 - v0)
                 x, y, spacing = x * (mpi.width - 1), y * (mpi.height - 1), spacings[plane]
                 width = max(error, PLANE_ERROR * spacing)

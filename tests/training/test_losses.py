@@ -208,7 +208,7 @@ def test_opaque_pixels_with_alpha_train_as_pixels_without(scene, tmp_path):
     model.train()
     rays, batch = manager.next_train(0)
     outputs = model.get_outputs(rays)
-    assert 0 < outputs["training"].samples.explained.float().mean() < 1
+    assert 0 < outputs["training"].samples.fully_covered.float().mean() < 1
     alpha = {**batch, "image": torch.cat([batch["image"], torch.ones(len(batch["image"]), 1)], -1)}
     plain, opaque = (model.get_loss_dict(outputs, b) for b in (batch, alpha))
     assert plain["rgb_loss"].item() == opaque["rgb_loss"].item() > 0

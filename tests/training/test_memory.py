@@ -93,12 +93,12 @@ def large_plan(texels: float) -> ScenePlan:
 
 @pytest.fixture
 def free(monkeypatch):
-    """Says how much memory of a GPU, which is not there, is free."""
+    """Sets the free memory that a GPU, which is not there, reports."""
 
-    def say(gib):
+    def set_free(gib):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (int(gib * 2**30), 80 * 2**30))
 
-    return say
+    return set_free
 
 
 def windows_of(plan: ScenePlan) -> WindowedPlan:

@@ -26,8 +26,8 @@ def slots_of(row, num_rays, slots, SLOTS: tl.constexpr, BLOCK: tl.constexpr):
 
 
 @triton.jit
-def _light(taus, valids, befores, slot, at, inside):
-    """Optical depth of each slot, the light before it, and which slots hold a sample."""
+def _transmittance(taus, valids, befores, slot, at, inside):
+    """Optical depth of each slot, the transmittance before it, and which slots hold a sample."""
     valid = inside & (tl.load(valids + at, inside, 0) != 0)
     earlier = inside & (slot > 0)
     earlier = earlier & (tl.load(valids + at - 1, earlier, 0) != 0)
@@ -41,8 +41,8 @@ def composite_kernel(
 ):
     """Weights of samples, and optical depths of rays."""
     ray, slot, at, inside = slots_of(tl.program_id(0), num_rays, slots, SLOTS, BLOCK)
-    tau, light, valid = _light(taus, valids, befores, slot, at, inside)
-    tl.store(weights + at, tl.where(valid, light * one_minus_exp(tau), 0.0), inside)
+    tau, transmittance, valid = _transmittance(taus, valids, befores, slot, at, inside)
+    tl.store(weights + at, tl.where(valid, transmittance * one_minus_exp(tau), 0.0), inside)
     depth = tl.sum(tau, 1)[:, None]
     tl.store(depths + ray, depth + tl.load(totals + ray, ray < num_rays, 0.0), ray < num_rays)
 
@@ -54,10 +54,10 @@ def composite_back_kernel(
 ):  # fmt: skip
     """Gradients of optical depths."""
     ray, slot, at, inside = slots_of(tl.program_id(0), num_rays, slots, SLOTS, BLOCK)
-    tau, light, valid = _light(taus, valids, befores, slot, at, inside)
+    tau, transmittance, valid = _transmittance(taus, valids, befores, slot, at, inside)
     later = inside & (slot + 1 < slots)
     hidden = tl.load(weights + at + 1, later, 0.0) * tl.load(to_weights + at + 1, later, 0.0)
-    slope = light * tl.exp(-tau) * tl.load(to_weights + at, valid, 0.0) - tl.cumsum(hidden, 1, reverse=True)
+    slope = transmittance * tl.exp(-tau) * tl.load(to_weights + at, valid, 0.0) - tl.cumsum(hidden, 1, reverse=True)
     slope += tl.load(to_depths + ray, ray < num_rays, 0.0)
     tl.store(to_taus + at, tl.where(valid, slope, 0.0), inside)
 

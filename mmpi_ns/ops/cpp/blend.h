@@ -44,13 +44,13 @@ inline float softplus(float x) { return x > 20 ? x : std::log1p(std::exp(x)); }
 inline float blended(const Scene& scene, const Packet& rays, const Crossings& crossings, int ray, int64_t own,
                      float inverse_t, float tau, std::vector<float>& votes) {
     if (tau <= NEGLIGIBLE) return tau / float(scene.num_heads);
-    float ndc[3], own_vote = 0, highest = -std::numeric_limits<float>::infinity(), others = 0;
+    float ndc[3], vote_of_head = 0, highest = -std::numeric_limits<float>::infinity(), others = 0;
     votes.clear();
     for (int64_t j = 0; j < scene.num_heads; j++) {
         if (!place(scene, rays, crossings, ray, j, inverse_t, ndc) && j != own) continue;
         const Grid& grid = scene.grids[j];
         if (j == own) {
-            own_vote = trilinear(scene.reliability, grid, ndc);
+            vote_of_head = trilinear(scene.reliability, grid, ndc);
         } else if (scene.touched[nearest_texel(grid, ndc)]) {
             votes.push_back(trilinear(scene.reliability, grid, ndc));
             highest = std::max(highest, votes.back());
@@ -58,7 +58,7 @@ inline float blended(const Scene& scene, const Packet& rays, const Crossings& cr
     }
     if (votes.empty()) return tau; // the sole cover
     for (float vote : votes) others += std::exp(vote - highest);
-    const float odds = highest - own_vote + std::log(others);
+    const float odds = highest - vote_of_head + std::log(others);
     const float log_share = -softplus(odds), log_rest = -softplus(-odds);
     const float alpha = -std::expm1(-tau) * std::exp(log_share);
     if (alpha < 0.5f) return -std::log1p(-alpha);

@@ -65,7 +65,7 @@ struct Crossing {
         const Lanes depth = pick(facing, dz, splat(1)), inverse_far = 1.0f / rays.far;
         u = direction[0] / depth, v = direction[1] / depth;
         u_slope = origin[0] - oz * u, v_slope = origin[1] - oz * v;
-        // Half-spaces p w <= q in disparity in which a plane is live.
+        // Half-spaces p w <= q in disparity in which a plane is intersected.
         const float* e = mpi.extent;
         const Lanes p[6] = {dz * rays.near + oz, -(dz + oz * inverse_far), u_slope, -u_slope, v_slope, -v_slope};
         const Lanes q[6] = {splat(1), -inverse_far, e[1] - u, u - e[0], e[3] - v, v - e[2]};
@@ -80,15 +80,15 @@ struct Crossing {
         }
         high = pick(never, splat(-1), floored(most(high, splat(-1))));
         low = pick(never, splat(mpi.last + 1), -floored(-least(low, splat(mpi.last + 1))));
-        const auto live = [&](Lanes m) {
+        const auto intersected = [&](Lanes m) {
             const Lanes w = m * mpi.step + mpi.end;
             Mask all = (w * oz < 1) & (m >= 0) & (m <= mpi.last);
             for (int i = 0; i < 6; i++) all &= p[i] * w <= q[i];
             return all;
         };
         // The division may be off by one plane at a border: the half-space test itself decides.
-        high = pick(live(high + 1), high + 1, pick(live(high), high, high - 1));
-        low = pick(live(low - 1), low - 1, pick(live(low), low, low + 1));
+        high = pick(intersected(high + 1), high + 1, pick(intersected(high), high, high - 1));
+        low = pick(intersected(low - 1), low - 1, pick(intersected(low), low, low + 1));
         first = truncated(high);
         count = facing & truncated(most(high - low + 1, Lanes{}));
     }
@@ -127,8 +127,8 @@ struct CubeCrossing {
 struct Crossings {
     std::vector<Crossing> mpis;
     CubeCrossing cube;
-    IntLanes total;  // of all heads
-    Mask explained;  // the heads cover the ray from before the first content out to infinity, or all heads may answer
+    IntLanes total;     // of all heads
+    Mask fully_covered; // from before the first content out to infinity, or by any head where all are allowed
 
     void cross(const Scene& scene, const Rays& rays, const Packet& packet) {
         const int64_t K = scene.num_mpis, H = scene.num_heads;
@@ -140,8 +140,8 @@ struct Crossings {
             count(h) &= packet.each<IntLanes>([&](int64_t ray) { return -int32_t(rays.heads[ray * H + h]); });
         total = cube.count;
         for (const Crossing& mpi : mpis) total += mpi.count;
-        explained = total > 0;
-        if (rays.priorities || rays.heads) explained &= sees_all(scene);
+        fully_covered = total > 0;
+        if (rays.priorities || rays.heads) fully_covered &= sees_all(scene);
     }
 
     IntLanes& count(int64_t head) { return head < int64_t(mpis.size()) ? mpis[head].count : cube.count; }
@@ -164,12 +164,12 @@ struct Crossings {
         Mask entered{}, endless{};
         for (size_t k = 0; k < mpis.size(); k++) {
             const Mpi& mpi = scene.mpis[k];
-            const Mask live = mpis[k].count > 0;
-            // One plane before the first live one bounds the entry; behind the camera: the ray starts inside.
+            const Mask intersected = mpis[k].count > 0;
+            // One plane before the first intersected one bounds the entry; behind the camera: the ray starts inside.
             const Lanes w = least(real(mpis[k].first + 1), splat(mpi.last)) * mpi.step + mpi.end;
             const Lanes bent = w * mpis[k].origin[2];
-            entered |= live & ((bent >= 1) | (w * mpis[k].direction[2] / (1 - bent) * scene.content_near >= 1));
-            if (mpi.end == 0) endless |= live & (mpis[k].first - mpis[k].count < 0);
+            entered |= intersected & ((bent >= 1) | (w * mpis[k].direction[2] / (1 - bent) * scene.content_near >= 1));
+            if (mpi.end == 0) endless |= intersected & (mpis[k].first - mpis[k].count < 0);
         }
         return entered & endless;
     }

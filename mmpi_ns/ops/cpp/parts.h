@@ -32,7 +32,7 @@ class Parts {
   public:
     static constexpr int64_t MOST = (1 << 16) - 1;
 
-    bool are_left() const {
+    bool any_left() const {
         const uint64_t now = ticket.load();
         return (now & MOST) < (now >> 16 & MOST);
     }
@@ -86,7 +86,7 @@ class Crew {
     }
 
     bool has_parts() const {
-        return urgent.are_left() || std::any_of(later, later + LATER, [](const Parts& parts) { return parts.are_left(); });
+        return urgent.any_left() || std::any_of(later, later + LATER, [](const Parts& parts) { return parts.any_left(); });
     }
 
     void wait() {
@@ -102,7 +102,7 @@ class Crew {
         asleep.fetch_sub(1);
     }
 
-    [[noreturn]] void live() {
+    [[noreturn]] void work_forever() {
         for (;;)
             if (!urgent.take() && !take_later()) wait();
     }
@@ -111,7 +111,7 @@ class Crew {
 
     void wake(int64_t helpers) {
         const std::lock_guard<std::mutex> held(lock);
-        for (process = getpid(); threads < helpers; threads++) std::thread([this] { live(); }).detach();
+        for (process = getpid(); threads < helpers; threads++) std::thread([this] { work_forever(); }).detach();
         if (asleep.load()) work.notify_all();
     }
 

@@ -1,9 +1,9 @@
 // One walk for all pictures: sixteen rays abreast through all heads, near to far, from one brick that holds something to
-// the next, until each is over; then what the samples that weigh enough hold, ray by ray. Templated on how texels are
-// stored: as floats in the bricks of training (march/show.cpp) or as bytes in baked bricks (baked/baked.cpp).
+// the next, until each terminates; then what the samples that weigh enough hold, ray by ray. Templated on how texels are
+// stored: as floats in the bricks of training (march/render.cpp) or as bytes in baked bricks (baked/baked.cpp).
 //
 // What a walk is made of, and what training (march/march.cpp) shares:
-//   ends.h       when a ray is over and what its depth is; the page's shader reads it too
+//   ends.h       when a ray terminates and what its depth is; the page's shader reads it too
 //   crossings.h  which planes of which heads a ray meets
 //   blend.h      what reliability makes of a sample
 //   here         stepping abreast, and sums
@@ -38,7 +38,7 @@ inline IntLanes ones(IntLanes x) {
 }
 
 // Sixteen rays on their way through one MPI. A tile is CELLS x CELLS cells (squares between four texels) of a plane.
-// Planes are counted from the nearest one. What lanes hold whose rays are over is not used.
+// Planes are counted from the nearest one. Lanes of terminated rays are not used.
 template <int CELLS> struct Walks {
     Lanes x_last, x_step, x_turns, y_last, y_step, y_turns; // texel on the last plane, from plane to plane; turns: 1 / step
     Lanes oz, dz;
@@ -138,7 +138,7 @@ struct CubeWalks {
 
 // Which samples of a ray are kept, and where it ends.
 struct Bounds {
-    float weight, light; // a sample weighs more; no less light is left
+    float weight, transmittance; // what a kept sample exceeds, and at which a ray terminates
 
     static Bounds exact(float threshold, float fair_share, int64_t samples) {
         if (threshold <= 0) return {-1, -1};
@@ -151,20 +151,20 @@ struct Outputs {
     float *gathered, *mass, *transmittance, *accumulation, *inverse_t, *winner, *dropped; // [R, C], [R, 1]
 };
 
-// Texels tell what sixteen samples read (Reads), what light passes them, and what one of them holds (Lookup).
+// Texels define what sixteen samples read (Reads), their transmittance, and what one of them holds (Lookup).
 template <typename Texels> class Walker {
   public:
     explicit Walker(const Texels& texels)
         : texels(texels), scene(texels.scene), walks(scene.num_mpis), masses(scene.num_heads) {}
 
-    void show(const Rays& rays, int64_t first, int64_t some, const Outputs& to) {
+    void render(const Rays& rays, int64_t first, int64_t some, const Outputs& to) {
         const Packet packet(rays, first, some);
         begin(rays, packet);
         walk(packet);
         finish();
         for (int64_t i = 0; i < some; i++) {
             sum(seen[i], first + i, to);
-            to.transmittance[first + i] = light[i], to.accumulation[first + i] = 1 - light[i];
+            to.transmittance[first + i] = transmittance[i], to.accumulation[first + i] = 1 - transmittance[i];
             to.dropped[first + i] = dropped[i];
         }
     }
@@ -185,7 +185,7 @@ template <typename Texels> class Walker {
     std::vector<Walks<Texels::CELLS>> walks;
     CubeWalks cube;
     std::vector<Seen> seen[WIDTH]; // of each ray, front to back
-    Lanes light, dropped, least_weight, least_light;
+    Lanes transmittance, dropped, least_weight, least_transmittance;
     std::vector<float> votes, masses;
 
     Lanes next(int32_t head) const {
@@ -194,11 +194,12 @@ template <typename Texels> class Walker {
 
     void begin(const Rays& rays, const Packet& packet) {
         crossings.cross(scene, rays, packet);
-        light = splat(1), dropped = Lanes{};
+        transmittance = splat(1), dropped = Lanes{};
         for (auto& samples : seen) samples.clear();
         const auto bounds = [&](int32_t samples) { return texels.bounds(samples); };
         least_weight = each_lane<Lanes>(crossings.total, [&](int32_t samples) { return bounds(samples).weight; });
-        least_light = each_lane<Lanes>(crossings.total, [&](int32_t samples) { return bounds(samples).light; });
+        const auto transmittances = [&](int32_t samples) { return bounds(samples).transmittance; };
+        least_transmittance = each_lane<Lanes>(crossings.total, transmittances);
         for (int64_t k = 0; k < scene.num_mpis; k++)
             walks[k].begin(texels.columns, texels.stacks[k], crossings.mpis[k], packet.there);
         if constexpr (Texels::HAS_CUBE) {
@@ -218,11 +219,11 @@ template <typename Texels> class Walker {
                 best = next(h) > top ? whole(h) : best;
                 top = most(next(h), top);
             }
-            const Mask left = (top >= 0) & ~(light <= least_light); // is_over
-            if (!any(left)) return;
-            const Lanes waiting = pick(left, top, splat(-1));
+            const Mask active = (top >= 0) & ~(transmittance <= least_transmittance); // not is_terminated
+            if (!any(active)) return;
+            const Lanes waiting = pick(active, top, splat(-1));
             const int32_t h = best[__builtin_ctz(bits(waiting == largest(waiting)))];
-            step(h, left & (best == h), packet);
+            step(h, active & (best == h), packet);
         }
     }
 
@@ -243,7 +244,7 @@ template <typename Texels> class Walker {
             through = texels.through(h, walks[h], going, reads);
         }
         through = pick(going, through, splat(1));
-        const Lanes weight = light * (1 - through);
+        const Lanes weight = transmittance * (1 - through);
         texels.weighed(reads, weight);
         const Mask kept = going & (weight > least_weight);
         for (uint32_t lanes = bits(kept); lanes; lanes &= lanes - 1) {
@@ -253,23 +254,23 @@ template <typename Texels> class Walker {
             texels.look_up(reads, i, sample.lookup);
         }
         dropped += pick(kept, Lanes{}, weight);
-        light *= through;
+        transmittance *= through;
         if (Texels::HAS_CUBE && h == scene.num_mpis)
             cube.index -= going, cube.arrive(*scene.cube, going);
         else
             walks[h].next(texels.columns, texels.stacks[h], going);
     }
 
-    // What rays leave behind their ends is no less than what the rest of their samples weighs.
+    // The transmittance of a terminated ray bounds the weights of the rest of its samples.
     void finish() {
-        Mask rest = light <= least_light;
+        Mask rest = transmittance <= least_transmittance;
         if (!Texels::ENDS_DARK) {
             Mask unseen = cube.inverse_t >= 0;
             for (const auto& walk : walks) unseen |= walk.inverse_t >= 0;
             rest = unseen;
         }
-        dropped += pick(rest, light, Lanes{});
-        if (Texels::ENDS_DARK) light = pick(rest, Lanes{}, light);
+        dropped += pick(rest, transmittance, Lanes{});
+        if (Texels::ENDS_DARK) transmittance = pick(rest, Lanes{}, transmittance);
     }
 
     void gather(const std::vector<Seen>& samples, float* to) const {
@@ -312,10 +313,10 @@ template <typename Texels> class Walker {
 
 // Rays [begin, end).
 template <typename Texels>
-void show(const Texels& texels, const Rays& rays, int64_t begin, int64_t end, const Outputs& to) {
+void render(const Texels& texels, const Rays& rays, int64_t begin, int64_t end, const Outputs& to) {
     Walker<Texels> walker(texels);
     for (int64_t ray = begin; ray < end; ray += WIDTH)
-        walker.show(rays, ray, std::min<int64_t>(WIDTH, end - ray), to);
+        walker.render(rays, ray, std::min<int64_t>(WIDTH, end - ray), to);
 }
 
 } // namespace

@@ -153,7 +153,7 @@ class _GatherTaps(torch.autograd.Function):
         to_values = torch.empty_like(values) if ctx.needs_input_grad[0] else None
         to_weights = torch.zeros_like(weights)
         moved = zip(taps[1::2], ctx.needs_input_grad[5::2], strict=True)
-        to_taps = [torch.zeros_like(x) if moves else None for x, moves in moved]
+        to_taps = [torch.zeros_like(x) if is_needed else None for x, is_needed in moved]
         batch = (values, *values.shape, _groups(taps, to_taps), slots, chosen, weights)
         grads = [pad(g, (0, -g.shape[1] % LANES)).contiguous() for g in (to_sums, to_first, 2 * to_second)]
         bounds = owned_bounds(taps[::2], len(values), AT_LEAST)

@@ -85,11 +85,11 @@ class MergedSamples:
     skipped_total: Float[Tensor, "R 1"]
     dropped_mass: Float[Tensor, "R 1"]
     """Sum of the weights of the dropped samples."""
-    live: Int[Tensor, "R"]
-    """Samples of each ray before dropping."""
-    explained: Bool[Tensor, "R 1"]
-    """Whether the heads that may answer must explain the whole ray: they cover it from before the first content out to
-    infinity, or all heads may answer and one does."""
+    num_intersected: Int[Tensor, "R"]
+    """Planes and voxels intersected by each ray: its samples before pruning."""
+    fully_covered: Bool[Tensor, "R 1"]
+    """Whether the allowed heads cover the ray from before the first content out to infinity, or all heads are allowed
+    and one is intersected. Such a ray must reproduce its whole pixel."""
     head_counts: tuple[int, ...] | None = None
     """Samples of each head, if known without synchronising; with a capacity those that there is room for."""
     capacity: Capacity | None = None
@@ -109,15 +109,15 @@ def empty_samples(*shape: int, index: torch.dtype = torch.int64, device: torch.d
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What rays show."""
+class RayOutputs:
+    """Outputs of rays that are rendered in one pass, without arrays of samples."""
 
     gathered: Float[Tensor, "R C"]
     """Sums of weight times colour and features, of the samples that are kept."""
     mass: Float[Tensor, "R 1"]
     """Sum of their weights."""
     transmittance: Float[Tensor, "R 1"]
-    """Light behind the last sample; of baked rays 0 where it is less than ``ends.OPAQUE_BAKED``."""
+    """Behind the last sample; of baked rays 0 where it is at most ``ends.OPAQUE_BAKED``."""
     accumulation: Float[Tensor, "R 1"]
     inverse_t: Float[Tensor, "R 1"]
     """At half the mass (``ops.composite.median_inverse_distance``); 0 for infinity, or without mass."""
@@ -126,28 +126,37 @@ class Shown:
     dropped_mass: Float[Tensor, "R 1"]
 
 
-def shown(name: str, num_rays: int, channels: int, *values: Any, folder: Path = OPS) -> Shown:
-    """What a compiled function of ``(begin, end, *values, outputs)`` shows (see ``build.call_in_parts``)."""
+def ray_outputs(name: str, num_rays: int, channels: int, *values: Any, folder: Path = OPS) -> RayOutputs:
+    """Outputs of a compiled function of ``(begin, end, *values, outputs)`` (see ``build.call_in_parts``)."""
     outputs = [torch.empty(num_rays, n) for n in (channels, 1, 1, 1, 1, 1, 1)]
     call_in_parts(name, num_rays, *values, structs(outputs), folder=folder)
-    return Shown(*outputs)
+    return RayOutputs(*outputs)
 
 
 def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     num_rays, room = len(rays.origins), options.most_kept(layout.most_samples)
     samples = structs(empty_samples(num_rays * room, index=torch.int32))
-    starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
-    explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
+    starts, kept, num_intersected = torch.empty(3, num_rays, dtype=torch.int64)
+    fully_covered, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
     walk = (layout.cpu_scene(tables), structs(dense_fields(rays)))
     how = (float(options.threshold), float(options.fair_share), options.blends)
-    call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, samples)
+    outputs = (starts, kept, num_intersected, fully_covered, skipped, dropped, samples)
+    call_in_parts("mmpi_march", num_rays, *walk, room, *how, *outputs)
     width = max(1, int(kept.max())) if num_rays else 1
     slots = [*empty_samples(num_rays, width), torch.empty(num_rays, width, dtype=torch.bool)]
     call_in_parts("mmpi_pack", num_rays, starts, kept, width, samples, structs(slots))
-    return MergedSamples(*slots, skipped_total=skipped, dropped_mass=dropped, live=live, explained=explained)
+    return MergedSamples(
+        *slots,
+        skipped_total=skipped,
+        dropped_mass=dropped,
+        num_intersected=num_intersected,
+        fully_covered=fully_covered,
+    )
 
 
-def show_rays_on_cpu(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
+def render_fused_on_cpu(
+    layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions
+) -> RayOutputs:
     if "tiles" not in layout.packed:
         # Rays pass over tiles from which nothing can be read: where the lower corner of four texels is in any other,
         # one of them is stored.
@@ -164,4 +173,4 @@ def show_rays_on_cpu(layout: SceneLayout, tables: Tables, features: Tensor, rays
     walk = (layout.cpu_scene(tables), structs(dense_fields(rays)))
     texels = (layout.packed["tiles"], *dense(features), *features.shape)
     how = (float(options.threshold), float(options.fair_share), options.blends)
-    return shown("mmpi_show", len(rays.origins), features.shape[1], *walk, *texels, *how)
+    return ray_outputs("mmpi_render", len(rays.origins), features.shape[1], *walk, *texels, *how)

@@ -1,8 +1,8 @@
 """All heads of a ray at once, front to back, to the samples that matter: to train with, and summed for pictures.
 
-The CPU's counterparts are ``march.cpp`` and ``show.cpp``. A program marches a few rays side by side (``gpu_walk.py``)
+The CPU's counterparts are ``march.cpp`` and ``render.cpp``. A program marches a few rays side by side (``gpu_walk.py``)
 and writes what they keep to slots, which are packed to train with, or read again and summed for pictures. A ray ends
-where less than 1e-5 of its light is left, and less than a sample must weigh to be kept.
+where its transmittance falls below 1e-5 and below the weight that a sample must have to be kept.
 """
 
 # Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
@@ -21,7 +21,7 @@ from mmpi_ns.ops import ends
 from mmpi_ns.ops.gather.gpu import activate, sizes
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
-from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, Shown, empty_samples
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, RayOutputs, Rays, empty_samples
 from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
@@ -33,7 +33,7 @@ RAYS = 4
 RANGES = 256
 """Rays of a program times their heads, of each of which it holds nine numbers: twice as many do not fit registers."""
 NUMBERS = 256
-"""Rays of a program of ``show_kernel`` times their channels: what its registers hold."""
+"""Rays of a program of ``render_kernel`` times their channels: what its registers hold."""
 
 
 @triton.jit
@@ -58,20 +58,20 @@ def _store_samples(
 
 @triton.jit
 def _bounds(samples, threshold, fair_share, KEEP_ALL: tl.constexpr):
-    """Weight that a sample of a ray exceeds to be kept, and light at which the ray ends (``Bounds`` of cpp/walk.h)."""
+    """Weight that a kept sample exceeds, and transmittance at which a ray terminates (``Bounds`` of cpp/walk.h)."""
     bound = tl.minimum(fair_share / tl.maximum(samples, 1).to(tl.float32), threshold)
     bound = bound * 0 - 1 if KEEP_ALL else bound
     return bound, tl.minimum(bound, OPAQUE)
 
 
 @triton.jit
-def _ends(left, met, light, depth, end_of_light, STEPS: tl.constexpr):
-    """How many samples rays go on to after a chunk, and the light left where one ends early, which is no less than what
-    all the rest weighs."""
-    unseen = tl.max(tl.where(met & (light <= end_of_light[:, None]), light, -1.0), 1)
-    left = tl.where(unseen >= 0, 0, left - STEPS)  # by rounds, so that no odd number can keep the loop going
-    over = (left > 0) & (tl.exp(-depth) <= end_of_light)
-    return tl.where(over, 0, left), tl.where(unseen >= 0, unseen, tl.where(over, tl.exp(-depth), 0.0))
+def _ends(remaining, met, transmittance, depth, least_transmittance, STEPS: tl.constexpr):
+    """Number of samples that remain after a chunk, and the transmittance of rays that terminate early, which bounds
+    the weight of all that remains."""
+    unseen = tl.max(tl.where(met & (transmittance <= least_transmittance[:, None]), transmittance, -1.0), 1)
+    remaining = tl.where(unseen >= 0, 0, remaining - STEPS)  # by rounds, so that no odd number can keep the loop going
+    terminated = (remaining > 0) & (tl.exp(-depth) <= least_transmittance)
+    return tl.where(terminated, 0, remaining), tl.where(unseen >= 0, unseen, tl.where(terminated, tl.exp(-depth), 0.0))
 
 
 @triton.jit
@@ -84,8 +84,8 @@ def _vectors(vectors, ray):
 @triton.jit(do_not_specialize=("num_rays", "room"))
 def march_kernel(
     origins, directions, nears, fars, allowed, priorities, constants, grids, biases, cube, density, reliability,
-    touched, live, explained, kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before,
-    numbers, num_rays, room, threshold, fair_share, content_near, K: tl.constexpr, HEADS: tl.constexpr,
+    touched, num_intersected, fully_covered, kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus,
+    skipped_before, numbers, num_rays, room, threshold, fair_share, content_near, K: tl.constexpr, HEADS: tl.constexpr,
     HAS_CUBE: tl.constexpr, ALLOWS: tl.constexpr, CHOOSES: tl.constexpr, BLENDS: tl.constexpr, KEEP_ALL: tl.constexpr,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
@@ -95,25 +95,25 @@ def march_kernel(
     ray = tl.where(exists, row, 0)
     x, y, z = _vectors(origins, ray)
     dx, dy, dz = _vectors(directions, ray)
-    first, count, u, bend_u, v, bend_v, local_z, local_dz, is_explained = cross(
+    first, count, u, bend_u, v, bend_v, local_z, local_dz, is_fully_covered = cross(
         ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, constants, cube, content_near,
         K, HEADS, HAS_CUBE, ALLOWS, CHOOSES,
     )  # fmt: skip
-    left, done = tl.sum(count, 1), count * 0
-    tl.store(live + row, left.to(tl.int64), exists)
-    tl.store(explained + row, is_explained, exists)
+    remaining, done = tl.sum(count, 1), count * 0
+    tl.store(num_intersected + row, remaining.to(tl.int64), exists)
+    tl.store(fully_covered + row, is_fully_covered, exists)
     if not KEEP_ALL:
         done = pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K, HEADS)
-    bound, end_of_light = _bounds(left, threshold, fair_share, KEEP_ALL)
-    left -= tl.sum(done, 1)
-    number_kept, of_heads, depth, skipped, dropped = left * 0, head_of * 0, bound * 0, bound * 0, bound * 0
-    while tl.max(left, 0) > 0:
+    bound, least_transmittance = _bounds(remaining, threshold, fair_share, KEEP_ALL)
+    remaining -= tl.sum(done, 1)
+    number_kept, of_heads, depth, skipped, dropped = remaining * 0, head_of * 0, bound * 0, bound * 0, bound * 0
+    while tl.max(remaining, 0) > 0:
         met, head, plane, p, q, s, inverse_t, tau, done = next_samples(
-            left > 0, first, count, done, u, bend_u, v, bend_v, local_z, local_dz, x, y, z, dx, dy, dz,
+            remaining > 0, first, count, done, u, bend_u, v, bend_v, local_z, local_dz, x, y, z, dx, dy, dz,
             constants, grids, biases, cube, density, reliability, touched, K, HEADS, HAS_CUBE, BLENDS, RAYS, STEPS,
         )  # fmt: skip
-        light = tl.exp(-(depth[:, None] + before(tau, STEPS)))
-        seen, weight = met & (light > end_of_light[:, None]), light * one_minus_exp(tau)
+        transmittance = tl.exp(-(depth[:, None] + before(tau, STEPS)))
+        seen, weight = met & (transmittance > least_transmittance[:, None]), transmittance * one_minus_exp(tau)
         keep, skip = seen & (weight > bound[:, None]), tl.where(seen & (weight <= bound[:, None]), tau, 0.0)
         keep = _store_samples(
             keep, ray, number_kept, room, head, plane, p, q, s, inverse_t, tau, skipped[:, None] + before(skip, STEPS),
@@ -125,7 +125,7 @@ def march_kernel(
         skipped += tl.sum(skip, 1)
         dropped += tl.sum(tl.where(skip > 0, weight, 0.0), 1)
         depth += tl.sum(tl.where(seen, tau, 0.0), 1)
-        left, rest = _ends(left, met, light, depth, end_of_light, STEPS)
+        remaining, rest = _ends(remaining, met, transmittance, depth, least_transmittance, STEPS)
         dropped += rest
     tl.store(kept + row, number_kept, exists)
     tl.store(skipped_total + row, skipped, exists)
@@ -159,12 +159,12 @@ def _read(table, grids, head, plane, place, has, channels, column, num_mpis, HAS
 def _weigh(taus, befores, slot, has, depth):
     """Weights of samples behind so much optical depth, and the depth behind them."""
     tau = tl.load(taus + slot, has, 0.0)
-    light = tl.exp(-(depth + tl.load(befores + slot, has, 0.0)))
-    return tl.where(has, light * one_minus_exp(tau), 0.0), depth + tau
+    transmittance = tl.exp(-(depth + tl.load(befores + slot, has, 0.0)))
+    return tl.where(has, transmittance * one_minus_exp(tau), 0.0), depth + tau
 
 
 @triton.jit(do_not_specialize=("num_rays", "room"))
-def show_kernel(
+def render_kernel(
     kept, heads, planes, places, inverse_ts, taus, befores, skipped, table, grids,
     gathered, masses, depths, medians, winners, num_rays, room, channels, num_mpis,
     HAS_CUBE: tl.constexpr, HEADS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
@@ -209,8 +209,8 @@ class Slots(NamedTuple):
     """See ``empty_samples``; [R, room] each."""
     skipped_total: Float[Tensor, "R 1"]
     dropped_mass: Float[Tensor, "R 1"]
-    live: Int[Tensor, "R"]
-    explained: Bool[Tensor, "R 1"]
+    num_intersected: Int[Tensor, "R"]
+    fully_covered: Bool[Tensor, "R 1"]
     numbers: Int[Tensor, "1+H"]
     """The most that a ray kept, then what was kept of each head."""
 
@@ -227,8 +227,8 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
         samples=empty_samples(num_rays, room, index=torch.int32, device=device),
         skipped_total=torch.empty(num_rays, 1, device=device),
         dropped_mass=torch.empty(num_rays, 1, device=device),
-        live=torch.empty(num_rays, dtype=torch.int64, device=device),
-        explained=torch.empty(num_rays, 1, dtype=torch.bool, device=device),
+        num_intersected=torch.empty(num_rays, dtype=torch.int64, device=device),
+        fully_covered=torch.empty(num_rays, 1, dtype=torch.bool, device=device),
         numbers=torch.zeros(1 + num_heads, dtype=torch.int32, device=device),
     )
     heads, (head_rows, biases, cube_row) = triton.next_power_of_2(num_heads), layout.constants
@@ -236,7 +236,7 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
     launch(
         march_kernel, num_rays, at_once, *parts,
         head_rows, grids_of(layout), biases, cube_row, *dense_fields(tables),
-        m.live, m.explained, m.kept, m.skipped_total, m.dropped_mass, *m.samples, m.numbers,
+        m.num_intersected, m.fully_covered, m.kept, m.skipped_total, m.dropped_mass, *m.samples, m.numbers,
         num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
         K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,
         ALLOWS=rays.heads is not None, CHOOSES=rays.priorities is not None, BLENDS=options.blends,
@@ -256,11 +256,13 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     valid = torch.arange(width, device=m.kept.device) < kept[:, None]
     packed = (torch.where(valid.view(valid.shape + (1,) * (x.ndim - 2)), x[:, :width], 0) for x in m.samples)
     heads, planes, *others = packed
-    left = (m.skipped_total, m.dropped_mass, m.live, m.explained, tuple(of_heads))
-    return MergedSamples(heads.long(), planes.long(), *others, valid, *left, capacity, m.numbers)
+    of_rays = (m.skipped_total, m.dropped_mass, m.num_intersected, m.fully_covered, tuple(of_heads))
+    return MergedSamples(heads.long(), planes.long(), *others, valid, *of_rays, capacity, m.numbers)
 
 
-def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
+def render_fused(
+    layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions
+) -> RayOutputs:
     """Nothing is packed, and the host need not know how much any ray kept."""
     m = march_into_slots(layout, tables, rays, options)
     num_rays, channels, device = len(rays.origins), features.shape[1], features.device
@@ -268,10 +270,10 @@ def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays,
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
     columns, block, warps = sizes(channels, device, NUMBERS)
     launch(
-        show_kernel, num_rays, block, m.kept, *m.samples, m.skipped_total, *dense(features),
+        render_kernel, num_rays, block, m.kept, *m.samples, m.skipped_total, *dense(features),
         grids_of(layout), gathered, mass, depth, median, winner,
         num_rays, m.samples[0].shape[1], channels, len(layout.mpis),
         HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
         num_warps=warps,
     )  # fmt: skip
-    return Shown(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, m.dropped_mass)
+    return RayOutputs(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, m.dropped_mass)

@@ -90,25 +90,25 @@ def _narrow(low, high, never, p, q, step, end):
 
 
 @triton.jit
-def _is_live(m, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last):
+def _is_intersected(m, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last):
     """Whether plane m meets all conditions: they decide where the division may be off by one."""
     w = m * step + end
-    live = (w * oz < 1) & (m >= 0) & (m <= last) & (near * w <= 1) & (far * w <= q_far)
-    live = live & (bend_u * w <= right) & (-bend_u * w <= left)
-    return live & (bend_v * w <= down) & (-bend_v * w <= up)
+    intersected = (w * oz < 1) & (m >= 0) & (m <= last) & (near * w <= 1) & (far * w <= q_far)
+    intersected = intersected & (bend_u * w <= right) & (-bend_u * w <= left)
+    return intersected & (bend_v * w <= down) & (-bend_v * w <= up)
 
 
 @triton.jit
 def _settle(m, out, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last):
     """The last plane of a range: m, or the next one out, or the next one in."""
-    more = _is_live(m + out, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last)
-    less = _is_live(m, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last)
+    more = _is_intersected(m + out, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last)
+    less = _is_intersected(m, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last)
     return tl.where(more, m + out, tl.where(less, m, m - out))
 
 
 @triton.jit
-def _live_range(frame, u, bend_u, v, bend_v, oz, dz, near, far):
-    """Of each ray in each MPI the number m of the nearest live plane, and how many are live."""
+def _intersected_range(frame, u, bend_u, v, bend_v, oz, dz, near, far):
+    """Of each ray in each MPI the number m of the nearest intersected plane, and how many are intersected."""
     # Half-spaces p w <= q of the disparity w: from near to far, and within the extent.
     far, extent = 1 / far, frame + EXTENT
     p_near, p_far = dz * near + oz, -(dz + oz * far)
@@ -167,7 +167,7 @@ def cross(ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, sc
     depth = tl.where(lz > EPS, lz, 1.0)
     u, v = lx / depth, ly / depth
     bend_u, bend_v = ox - oz * u, oy - oz * v
-    first, count = _live_range(frame, u, bend_u, v, bend_v, oz, lz, near, far)
+    first, count = _intersected_range(frame, u, bend_u, v, bend_v, oz, lz, near, far)
     count = tl.where(exists[:, None] & is_mpi, count, 0)
     if CHOOSES:
         met = tl.load(priorities + at * K + head, count > 0, -1.0)
@@ -179,18 +179,18 @@ def cross(ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, sc
     if ALLOWS:
         may = tl.load(allowed + at * (K + HAS_CUBE) + head, head < K + HAS_CUBE, 0)
         count = tl.where(may != 0, count, 0)
-    explained = tl.max(count, 1) > 0
+    fully_covered = tl.max(count, 1) > 0
     if ALLOWS + CHOOSES > 0:
         # An MPI reaches to infinity, and the first one is entered before the first content. One plane before the
-        # first live one bounds the entry; behind the camera: the ray starts inside.
-        live, step, end = is_mpi & (count > 0), tl.load(frame + STEP), tl.load(frame + END)
+        # first intersected one bounds the entry; behind the camera: the ray starts inside.
+        intersected, step, end = is_mpi & (count > 0), tl.load(frame + STEP), tl.load(frame + END)
         w = tl.minimum((first + 1).to(tl.float32), tl.load(frame + LAST)) * step + end
         starts_inside = w * oz >= 1
         entry = w * lz / tl.where(starts_inside, 1.0, 1 - w * oz)
-        entered = live & (starts_inside | (entry * content_near >= 1))
-        endless = live & (first - count < 0) & (end == 0)
-        explained = explained & (tl.max(entered.to(tl.int32), 1) > 0) & (tl.max(endless.to(tl.int32), 1) > 0)
-    return first, count, u, bend_u, v, bend_v, oz, lz, explained
+        entered = intersected & (starts_inside | (entry * content_near >= 1))
+        endless = intersected & (first - count < 0) & (end == 0)
+        fully_covered = fully_covered & (tl.max(entered.to(tl.int32), 1) > 0) & (tl.max(endless.to(tl.int32), 1) > 0)
+    return first, count, u, bend_u, v, bend_v, oz, lz, fully_covered
 
 
 # Samples -------------------------------------------------------------------------------------------------------------
@@ -295,7 +295,7 @@ def in_cube(cube, x, y, z, dx, dy, dz, inverse_t):
 
 
 @triton.jit
-def _count_vote(own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick):
+def _count_vote(vote_of_head, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick):
     """Adds head k's vote on samples: (mpi vote, highest of the others, sum of e^(other - highest))."""
     is_own = head == k
     looked_up = thick & (inside | is_own)
@@ -308,7 +308,7 @@ def _count_vote(own_vote, highest, others, grids, reliability, touched, k, head,
     higher = tl.where(counts, tl.maximum(highest, vote), highest)
     # -1e30 instead of -infinity: differences of it are numbers.
     others = tl.where(counts, others * tl.exp(highest - higher) + tl.exp(vote - higher), others)
-    return tl.where(is_own, vote, own_vote), higher, others
+    return tl.where(is_own, vote, vote_of_head), higher, others
 
 
 @triton.jit
@@ -316,19 +316,19 @@ def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, he
            K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
     """Optical depths after blending (``blending.blend_shares`` and ``blended_optical_depth``)."""
     thick = asked & (tau > NEGLIGIBLE)
-    own_vote, highest, others = tau * 0, tau * 0 - 1e30, tau * 0
+    vote_of_head, highest, others = tau * 0, tau * 0 - 1e30, tau * 0
     for k in range(K):
         u, v, s, inside = in_mpi(constants, k, x, y, z, dx, dy, dz, inverse_t)
-        own_vote, highest, others = _count_vote(
-            own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick
+        vote_of_head, highest, others = _count_vote(
+            vote_of_head, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick
         )
     if HAS_CUBE:
         u, v, s, inside = in_cube(cube, x, y, z, dx, dy, dz, inverse_t)
-        own_vote, highest, others = _count_vote(
-            own_vote, highest, others, grids, reliability, touched, K, head, u, v, s, inside, thick
+        vote_of_head, highest, others = _count_vote(
+            vote_of_head, highest, others, grids, reliability, touched, K, head, u, v, s, inside, thick
         )
     sole = others == 0
-    odds = tl.where(sole, 0.0, highest - own_vote + tl.log(tl.where(sole, 1.0, others)))
+    odds = tl.where(sole, 0.0, highest - vote_of_head + tl.log(tl.where(sole, 1.0, others)))
     log_share, log_rest = -softplus(odds), -softplus(-odds)
     alpha, lower = one_minus_exp(tau) * tl.exp(log_share), log_share - tau
     opaque = tl.maximum(log_rest, lower) + softplus(-tl.abs(log_rest - lower))

@@ -141,11 +141,11 @@ class Training {
   public:
     Training(const Scene& scene, float threshold, float fair_share, bool blends)
         : scene(scene), threshold(threshold), fair_share(fair_share), blends(blends), runs(scene.num_heads),
-          live(scene.num_heads), nearest(scene.num_heads) {}
+          waiting(scene.num_heads), nearest(scene.num_heads) {}
 
     // Marches one of sixteen rays.
     void march(const Packet& rays, const Crossings& crossings, int ray, Slots& to, float& skipped, float& dropped) {
-        int64_t alive = 0;
+        int64_t num_waiting = 0;
         for (int64_t h = 0; h < scene.num_heads; h++) {
             const bool in_cube = h == scene.num_mpis;
             Run& run = runs[h];
@@ -154,19 +154,19 @@ class Training {
             run.first = (in_cube ? crossings.cube.first : crossings.mpis[h].first)[ray];
             run.begin = 0, run.size = 0, run.at = -1;
             advance(run, rays, crossings, ray, h);
-            if (!run.done()) nearest[alive] = run.next(), live[alive++] = h;
+            if (!run.done()) nearest[num_waiting] = run.next(), waiting[num_waiting++] = h;
         }
         const Bounds bounds = Bounds::exact(threshold, fair_share, crossings.total[ray]);
-        float light = 1;
+        float transmittance = 1;
         skipped = dropped = 0;
-        while (alive) {
+        while (num_waiting) {
             int64_t best = 0;
-            for (int64_t i = 1; i < alive; i++) // equal distances: the first head comes first
+            for (int64_t i = 1; i < num_waiting; i++) // equal distances: the first head comes first
                 best = nearest[i] > nearest[best] ? i : best;
-            const int64_t h = live[best];
+            const int64_t h = waiting[best];
             Run& run = runs[h];
-            if (is_over(light, bounds.light)) {
-                dropped += light; // no less than what all the rest weighs
+            if (is_terminated(transmittance, bounds.transmittance)) {
+                dropped += transmittance; // bounds the weights of all the rest
                 break;
             }
             float tau = run.tau[run.at], pass = run.pass[run.at];
@@ -174,19 +174,19 @@ class Training {
                 tau = blended(scene, rays, crossings, ray, h, run.inverse_t[run.at], tau, votes);
                 pass = std::exp(-tau);
             }
-            const float weight = light * (1 - pass);
+            const float weight = transmittance * (1 - pass);
             if (weight > bounds.weight)
                 to.keep(run, h, tau, skipped);
             else
                 skipped += tau, dropped += weight;
-            light *= pass;
+            transmittance *= pass;
             advance(run, rays, crossings, ray, h);
             if (!run.done()) {
                 nearest[best] = run.next();
                 continue;
             }
-            alive--;
-            for (int64_t i = best; i < alive; i++) live[i] = live[i + 1], nearest[i] = nearest[i + 1];
+            num_waiting--;
+            for (int64_t i = best; i < num_waiting; i++) waiting[i] = waiting[i + 1], nearest[i] = nearest[i + 1];
         }
     }
 
@@ -195,7 +195,7 @@ class Training {
     const float threshold, fair_share;
     const bool blends;
     std::vector<Run> runs;
-    std::vector<int64_t> live;  // heads that have samples left,
+    std::vector<int64_t> waiting; // heads with further samples,
     std::vector<float> nearest; // and the inverse distance of the next one of each
     std::vector<float> votes;
 
@@ -213,7 +213,7 @@ class Training {
 // Marches rays [begin, end), each of which keeps `room` samples at most. What they keep is written one ray behind the
 // other, from begin * room on; where a ray's samples begin, to starts[ray]; how many, to kept[ray].
 void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, int64_t room, float threshold,
-                float fair_share, bool blends, int64_t* starts, int64_t* kept, int64_t* live, bool* explained,
+                float fair_share, bool blends, int64_t* starts, int64_t* kept, int64_t* intersected, bool* fully_covered,
                 float* skipped_total, float* dropped_mass, const Samples<int32_t>* samples) {
     Training training(*scene, threshold, fair_share, blends);
     Crossings crossings;
@@ -225,7 +225,7 @@ void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays
             starts[ray] = slots.size;
             training.march(packet, crossings, int(ray - first), slots, skipped_total[ray], dropped_mass[ray]);
             kept[ray] = slots.size - starts[ray];
-            live[ray] = crossings.total[ray - first], explained[ray] = crossings.explained[ray - first];
+            intersected[ray] = crossings.total[ray - first], fully_covered[ray] = crossings.fully_covered[ray - first];
         }
     }
 }

@@ -19,7 +19,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import OPAQUE_BAKED
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.layout import dense, dense_fields, frame_rows, shaped
-from mmpi_ns.ops.march import Rays, Shown, shown
+from mmpi_ns.ops.march import RayOutputs, Rays, ray_outputs
 from mmpi_ns.scene.geometry import Frames
 from mmpi_show.ops import OPS
 from mmpi_show.ops.baked import reader
@@ -27,7 +27,9 @@ from mmpi_show.scene import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, ti
 
 
 @operation()
-def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tensor, "B 8 8"] | None = None) -> Shown:
+def render_baked(
+    scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tensor, "B 8 8"] | None = None
+) -> RayOutputs:
     """Sums of each ray's samples, front to back.
 
     Args:
@@ -50,14 +52,14 @@ def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tens
         "texels_array": scene.texels.numpy(),
     }
     samples = reader.march(window, *(x.double().numpy() for x in rays[:4]))
-    inverse_t, weights, heads, texels, _, light = map(torch.from_numpy, samples)
+    inverse_t, weights, heads, texels, _, transmittance = map(torch.from_numpy, samples)
     if peaks is not None and len(scene.density):
         each = weights[..., None].expand(texels.shape)
         peaks.view(-1).scatter_reduce_(0, texels.flatten(), each.flatten().to(peaks), "amax")
     kept = weights > threshold
     weights = torch.where(kept, weights, 0.0)
-    mass, transmittance = weights.sum(-1, keepdim=True), torch.where(light > OPAQUE_BAKED, light, 0.0)
-    shown = (
+    mass, transmittance = weights.sum(-1, keepdim=True), torch.where(transmittance > OPAQUE_BAKED, transmittance, 0.0)
+    outputs = (
         torch.from_numpy(reader.gather(window, samples, kept.numpy())),
         mass,
         transmittance,
@@ -66,7 +68,7 @@ def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tens
         winning_heads(weights, heads, len(scene.mpis)),
         (1 - transmittance - mass).clamp(min=0),
     )
-    return Shown(*(x.to(rays.origins) for x in shown))
+    return RayOutputs(*(x.to(rays.origins) for x in outputs))
 
 
 @operation()
@@ -80,7 +82,7 @@ def shade_baked(
 
     Args:
         shader: the network.
-        gathered: see ``Shown``.
+        gathered: see ``RayOutputs``.
         mass: likewise.
         directions: unit, world axes.
     """
@@ -92,8 +94,8 @@ def shade_baked(
     return torch.from_numpy(reader.shade(window, mean, directions.double().numpy())).to(gathered)
 
 
-@show_baked.on_cpu
-def show_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Tensor | None = None) -> Shown:
+@render_baked.on_cpu
+def render_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Tensor | None = None) -> RayOutputs:
     if "cpu" not in scene.packed:
         count, bricks, channels = len(scene.mpis), scene.num_bricks, len(scene.channel_codes)
         assert channels <= MOST_CHANNELS
@@ -123,7 +125,7 @@ def show_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Ten
     if peaks is not None:
         assert dense(peaks)[0] is peaks, "peaks are written in place"
     walk = (scene.packed["cpu"], structs(dense_fields(rays)), float(threshold), peaks)
-    return shown("mmpi_show_baked", len(rays.origins), len(scene.channel_codes), *walk, folder=OPS)
+    return ray_outputs("mmpi_render_baked", len(rays.origins), len(scene.channel_codes), *walk, folder=OPS)
 
 
 @shade_baked.on_cpu

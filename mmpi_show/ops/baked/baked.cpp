@@ -1,4 +1,4 @@
-// What rays show of baked bricks (scene/baked.py): bytes, of which a sample reads one brick alone. The example in
+// Rendering of rays from baked bricks (scene/baked.py): bytes, of which a sample reads one brick alone. The example in
 // NumPy is reader.py.
 #include "parts.h"
 #include "walk.h"
@@ -139,11 +139,11 @@ struct Bytes {
 };
 
 // Where peaks are asked for, the largest weight that reads a texel is written there.
-void mmpi_show_baked(int64_t begin, int64_t end, const BakedScene* scene, const Rays* rays, float threshold,
+void mmpi_render_baked(int64_t begin, int64_t end, const BakedScene* scene, const Rays* rays, float threshold,
                      float* peaks, const Outputs* to) {
-    show(Bytes(*scene, threshold, peaks), *rays, begin, end, *to);
+    render(Bytes(*scene, threshold, peaks), *rays, begin, end, *to);
 }
 
 } // namespace
 
-IN_PARTS(mmpi_show_baked)
+IN_PARTS(mmpi_render_baked)

@@ -30,7 +30,7 @@ class Samples(NamedTuple):
     mpis: np.ndarray  # [R, S]
     texels: np.ndarray  # [R, S, 4] that a sample reads, counted through all bricks
     shares: np.ndarray  # [R, S, 4] of these
-    light: np.ndarray  # [R, 1] behind the last sample
+    transmittance: np.ndarray  # [R, 1] behind the last sample
 
 
 def read(folder: Path) -> dict[str, Any]:
@@ -120,10 +120,12 @@ def _cross(window: Window, mpi: dict[str, Any], rays: tuple[np.ndarray, ...]) ->
     u0, u1, v0, v1 = mpi["extent"]
     x = ((ox - oz * dx / dz) * w + dx / dz - u0) / (u1 - u0) * across
     y = ((oy - oz * dy / dz) * w + dy / dz - v0) / (v1 - v0) * down
-    live = ahead & (inverse_t * near <= 1) & (inverse_t >= 1 / far) & (x >= 0) & (x <= across) & (y >= 0) & (y <= down)
-    x, y = np.where(live, x, 0), np.where(live, y, 0)
+    intersected = (
+        ahead & (inverse_t * near <= 1) & (inverse_t >= 1 / far) & (x >= 0) & (x <= across) & (y >= 0) & (y <= down)
+    )
+    x, y = np.where(intersected, x, 0), np.where(intersected, y, 0)
     column, row = (np.minimum(a.astype(int), n - 1) // 7 for a, n in ((x, across), (y, down)))
-    brick = np.where(live, numbers[planes, row, column], -1)
+    brick = np.where(intersected, numbers[planes, row, column], -1)
     x, y = x - 7 * column, y - 7 * row
     i, j = np.minimum(y.astype(int), 6), np.minimum(x.astype(int), 6)
     texels = (np.maximum(brick, 0) * 64 + i * 8 + j)[..., None] + CORNERS
@@ -187,8 +189,8 @@ def render(window: Window, origins: np.ndarray, directions: np.ndarray) -> np.nd
     mass = (samples.weights * kept).sum(1, keepdims=True)
     color = shade(window, gather(window, samples, kept) / np.maximum(mass, 1e-6), directions)
     color = np.where(mass > 0, color * window.get("exposure", 1.0), 0.0)
-    light = np.where(samples.light > 1e-2, samples.light, 0.0)
-    return np.clip(color * (1 - light) + light * window["background"], 0, 1)
+    transmittance = np.where(samples.transmittance > 1e-2, samples.transmittance, 0.0)
+    return np.clip(color * (1 - transmittance) + transmittance * window["background"], 0, 1)
 
 
 if __name__ == "__main__":

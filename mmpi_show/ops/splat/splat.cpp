@@ -73,39 +73,40 @@ std::vector<Seen> sorted(const View& view, const Gaussians& all) {
     return seen;
 }
 
-// Tells of every Gaussian at every pixel that it changes: its number, the pixel, its alpha there, the light before it.
-// Returns the light that passes each pixel.
+// Calls `tell` for every Gaussian at every pixel that it changes: its number, the pixel, its alpha there and the
+// transmittance in front of it. Returns the transmittance of each pixel.
 template <typename Tell> std::vector<float> lay(const View& view, const std::vector<Seen>& seen, Tell tell) {
-    std::vector<float> light(int64_t(view.width) * view.height, 1.0f); // negative once a pixel is done
+    std::vector<float> transmittance(int64_t(view.width) * view.height, 1.0f); // negative once a pixel is done
     for (const Seen& one : seen)
         for (int32_t row = one.top; row <= one.bottom; row++) {
             const float dy = float(row) + 0.5f - one.v;
             for (int32_t column = one.left; column <= one.right; column++) {
                 const int64_t pixel = int64_t(row) * view.width + column;
-                if (light[pixel] < 0) continue;
+                if (transmittance[pixel] < 0) continue;
                 const float dx = float(column) + 0.5f - one.u;
                 const float power = 0.5f * (one.a * dx * dx + one.c * dy * dy) + one.b * dx * dy;
                 const float alpha = std::min(STRONGEST, one.alpha * std::exp(-power));
                 if (alpha < FAINTEST) continue;
-                const float before = light[pixel], after = before * (1 - alpha);
-                light[pixel] = after > OPAQUE ? after : -before;
+                const float before = transmittance[pixel], after = before * (1 - alpha);
+                transmittance[pixel] = after > OPAQUE ? after : -before;
                 if (after > OPAQUE) tell(one.index, pixel, alpha, before);
             }
         }
-    for (float& x : light) x = std::fabs(x);
-    return light;
+    for (float& x : transmittance) x = std::fabs(x);
+    return transmittance;
 }
 
 } // namespace
 
 extern "C" {
 
-// An image [height, width, 4] of colours and passing light.
+// An image [height, width, 4] of colours and transmittance.
 void mmpi_splat_image(const View* view, const Gaussians* all, const float* colors, float* image) {
-    const auto light = lay(*view, sorted(*view, *all), [&](int64_t i, int64_t pixel, float alpha, float before) {
+    const auto add = [&](int64_t i, int64_t pixel, float alpha, float before) {
         for (int c = 0; c < 3; c++) image[4 * pixel + c] += before * alpha * colors[3 * i + c];
-    });
-    for (size_t p = 0; p < light.size(); p++) image[4 * p + 3] = light[p];
+    };
+    const auto transmittance = lay(*view, sorted(*view, *all), add);
+    for (size_t p = 0; p < transmittance.size(); p++) image[4 * p + 3] = transmittance[p];
 }
 
 // Sums [count, 6] over the pixels of an image: of each Gaussian's weight times (error, 1), and, with J what a number of

@@ -8,10 +8,10 @@ import pytest
 import torch
 from bricked import bricked_field
 from compiled import compiled  # noqa: F401
+from fused import as_float64_says, compare, no_rays_give_empty_outputs, rendered
 from hand_made import make_mpi
 from marches import hard_plan, hard_rays
 from random_fields import bundle, random_field, random_rays
-from shows import as_float64_says, compare, nothing_is_shown_of_nothing, shown
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
@@ -20,8 +20,8 @@ from mmpi_ns.scene.plan import ScenePlan
 
 @pytest.fixture(autouse=True)
 def side_by_side(monkeypatch):
-    assert dispatch.form_of("show_rays", torch.zeros(1)) == "cpu"
-    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    assert dispatch.form_of("render_fused", torch.zeros(1)) == "cpu"
+    monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at T = 1e-4
 
 
 @pytest.mark.parametrize("blends", [True, False])
@@ -69,13 +69,13 @@ def test_rays_do_not_see_their_neighbours():
     """Whatever their number, their order and the threads, each shows what it shows alone, to the bit."""
     field = random_field(3, True, seed=5, planes=40)
     origins, directions = random_rays(field.plan, 700, seed=6)
-    whole, threads = shown(field, bundle(origins, directions), 1e-3, True), torch.get_num_threads()
-    parts = [shown(field, bundle(origins[p], directions[p]), 1e-3, True)
+    whole, threads = rendered(field, bundle(origins, directions), 1e-3, True), torch.get_num_threads()
+    parts = [rendered(field, bundle(origins[p], directions[p]), 1e-3, True)
              for p in (slice(0, 1), slice(1, 18), slice(18, 700))]  # fmt: skip
-    turned = shown(field, bundle(origins[::-1].copy(), directions[::-1].copy()), 1e-3, True)
+    turned = rendered(field, bundle(origins[::-1].copy(), directions[::-1].copy()), 1e-3, True)
     try:
         torch.set_num_threads(2)
-        halves = shown(field, bundle(origins, directions), 1e-3, True)
+        halves = rendered(field, bundle(origins, directions), 1e-3, True)
     finally:
         torch.set_num_threads(threads)
     for name, values in vars(whole).items():
@@ -88,7 +88,7 @@ def test_behind_an_opaque_plane_nothing_is_read_and_a_hundred_thousandth_is_lost
     behind = field.grids[0].rows[10 * field.grids[0].height * field.grids[0].width :]
     field.density.data[field.grids[0].rows] = 30.0
     field.density.data[behind], field.features.data[behind] = math.nan, math.nan
-    found = shown(field, bundle([[0, 0, 0]], [[0, 0, 1]]), 1e-3)
+    found = rendered(field, bundle([[0, 0, 0]], [[0, 0, 1]]), 1e-3)
     assert found.accumulation.item() == pytest.approx(1, abs=1e-5) and found.gathered.isfinite().all()
     assert 0 < found.dropped_mass.item() <= 1e-5
 
@@ -97,11 +97,11 @@ def test_after_growth_and_release_rays_pass_other_tiles():
     """What is known of the tiles belongs to one layout."""
     field = bricked_field(0.6)
     rays = bundle(*random_rays(field.plan, 100, seed=1))
-    before = shown(field, rays, 1e-3)
+    before = rendered(field, rays, 1e-3)
     field._keep(torch.rand(field.num_bricks + 1, generator=torch.Generator().manual_seed(3)) < 0.5)
     after = compare(field, rays, 1e-3)
     assert (before.mass - after.mass).abs().max() > 0.1
 
 
 def test_rays_that_meet_nothing_and_no_rays_show_nothing():
-    nothing_is_shown_of_nothing()
+    no_rays_give_empty_outputs()

@@ -1,4 +1,4 @@
-// What rays show of the bricks of training.
+// Rendering of rays from the bricks of training.
 #include "parts.h"
 #include "taps.h"
 #include "walk.h"
@@ -109,13 +109,13 @@ struct Floats {
     }
 };
 
-void mmpi_show(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, const Tiles* tiles,
+void mmpi_render(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, const Tiles* tiles,
                const float* features, int64_t rows, int64_t channels, float threshold, float fair_share, bool blends,
                const Outputs* to) {
     const Floats texels(*scene, *tiles, Table{features, rows, channels}, threshold, fair_share, blends);
-    show(texels, *rays, begin, end, *to);
+    render(texels, *rays, begin, end, *to);
 }
 
 } // namespace
 
-IN_PARTS(mmpi_show)
+IN_PARTS(mmpi_render)

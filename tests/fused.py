@@ -10,20 +10,20 @@ from random_fields import OracleRay, _places, _table, bundle, random_field, rand
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.sampler import rays_of, show_rays
+from mmpi_ns.sampler import rays_of, render_fused
 
 
-def shown(field, rays, threshold=0.0, blends=False, **chosen):
+def rendered(field, rays, threshold=0.0, blends=False, **chosen):
     """What rays show, whatever heads may answer them."""
     options = MarchOptions(threshold, blends=blends)
-    return show_rays(field.layout, field.tables, field.features.data, rays_of(rays, **chosen), options)
+    return render_fused(field.layout, field.tables, field.features.data, rays_of(rays, **chosen), options)
 
 
 def compare(field, rays, *how, error=3e-5, **chosen):
     """The kernels' sums are the reference's, but for rays with a sample whose weight is the threshold's."""
-    found = shown(field, rays, *how, **chosen)
+    found = rendered(field, rays, *how, **chosen)
     with dispatch.chosen("torch"):
-        wanted = shown(field, rays, *how, **chosen)
+        wanted = rendered(field, rays, *how, **chosen)
     same = torch.ones(len(rays), dtype=torch.bool)
     for name, b in vars(wanted).items():
         a = getattr(found, name)
@@ -36,7 +36,7 @@ def compare(field, rays, *how, error=3e-5, **chosen):
 def as_float64_says(field, count, blends=True):
     """Checks rays that no decision is close on; returns how many those are."""
     origins, directions = random_rays(field.plan, count, seed=6)
-    found, checked = shown(field, bundle(origins, directions), 0.0, blends), 0
+    found, checked = rendered(field, bundle(origins, directions), 0.0, blends), 0
     for i in range(count):
         ray = OracleRay(field, origins[i], directions[i])
         if ray.margin < 1e-5:
@@ -60,11 +60,11 @@ def as_float64_says(field, count, blends=True):
     return checked
 
 
-def nothing_is_shown_of_nothing():
+def no_rays_give_empty_outputs():
     """Rays that meet nothing, and no rays."""
     field = random_field(2, seed=1)
-    found = shown(field, bundle([[0, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 1, 0]], far=1e-3))
+    found = rendered(field, bundle([[0, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 1, 0]], far=1e-3))
     assert (found.transmittance == 1).all() and all(
         (getattr(found, n) == 0).all() for n in ("gathered", "mass", "inverse_t", "accumulation", "dropped_mass")
     )
-    assert shown(field, bundle(np.zeros((0, 3)), np.zeros((0, 3)))).gathered.shape == (0, 5)
+    assert rendered(field, bundle(np.zeros((0, 3)), np.zeros((0, 3)))).gathered.shape == (0, 5)
