@@ -13,8 +13,8 @@ from unittest import mock
 import numpy as np
 import torch
 from report import Bench, Report, Row, page, table
+from trainers import clock
 
-from mmpi_ns.bench.trainers import clock
 from mmpi_ns.data.dataset import image_and_mask
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.rendering import details

@@ -19,14 +19,14 @@ from typing import Any
 
 import torch
 from apart import Tell
+from gpu_quick import drive
 from kernel_checks import run_checks
 from lab import median_s
 from methods import TWO_PHASE
 from report import Row, slug
 from torch import Tensor
+from trainers import BARE, P, Scene, Steps, train_words
 
-from mmpi_ns.bench.gpu import drive
-from mmpi_ns.bench.trainers import BARE, P, Scene, Steps, train_words
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics

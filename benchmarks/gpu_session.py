@@ -50,9 +50,8 @@ class Part:
 
 def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     """Everything, in the order of what is wanted most."""
-    python, bench = [sys.executable], [sys.executable, "-m", "mmpi_ns.scripts.bench"]
-    gpu, train = ([sys.executable, str(ROOT / "benchmarks" / name)] for name in ("gpu.py", "train.py"))
-    steps = [sys.executable, str(ROOT / "benchmarks" / "gpu_steps.py")]
+    python, names = [sys.executable], ("gpu.py", "gpu_quick.py", "gpu_steps.py", "train.py")
+    gpu, quick, steps, train = ([*python, str(ROOT / "benchmarks" / name)] for name in names)
     where = ["--output", str(out), "--work", str(work)]
     look = "import platform, torch; print(platform.python_version(), torch.__version__, torch.version.cuda, flush=True)"
     look += "; import triton; print('Triton', triton.__version__, flush=True)"
@@ -61,7 +60,7 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     return [
         Part("device", ["nvidia-smi"], 20),
         Part("environment", [*python, "-c", look], 90),
-        Part("quick", [*bench, "gpu", "--folder", str(work / "quick")], 120),
+        Part("quick", [*quick, "--folder", str(work / "quick")], 120),
         Part("tests", [*python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", "tests/ops"], 120),
         Part("costs", [*steps, "costs", "--out", str(out / "costs.json")], 40),
         *(

@@ -17,8 +17,7 @@ from pathlib import Path
 
 import torch
 from torch.profiler import ProfilerActivity, profile
-
-from mmpi_ns.bench.trainers import Scene, Steps, clock, train_words
+from trainers import Scene, Steps, clock, train_words
 
 NODES = (1, 100, 700)
 """Of graphs whose replay is timed."""

@@ -17,8 +17,7 @@ from typing import Any
 
 from apart import environment_of
 from report import Bench, Row, commit, processor, read_json
-
-from mmpi_ns.bench.trainers import Scene, clock
+from trainers import Scene, clock
 
 
 @dataclass(kw_only=True)

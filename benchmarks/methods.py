@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-
-from mmpi_ns.bench.trainers import BARE, P, Scene, train_words
+from trainers import BARE, P, Scene, train_words
 
 TWO_PHASE = ("--pipeline.model.schedule.training", "two-phase")
 """All rays for each MPI, a little blending, and a long fine-tune at full rates, unless more options follow."""

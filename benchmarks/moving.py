@@ -16,8 +16,8 @@ from lab import train_and_evaluate
 from numpy.typing import NDArray
 from PIL import Image
 from report import Bench, Report, Row, page, table
+from trainers import Scene
 
-from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.config import mmpi_small
 from mmpi_ns.data.posed_images import at_full_size, posed_images
 from mmpi_ns.scripts.command import run

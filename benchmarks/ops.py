@@ -16,8 +16,8 @@ from lab import SceneBench, figure, median_s
 from methods import METHODS
 from report import Report, Row, page, slug, table, title
 from torch import Tensor
+from trainers import Steps
 
-from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.field.tables import Lookup
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.composite import composite_weights

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch
+from score import evenly
 from torch import Tensor
 
-from mmpi_ns.bench.score import evenly
 from mmpi_ns.scene.geometry import Frames, PlaneHits, inverse_distance, sample_disparity
 
 Image = tuple[Any, Tensor]

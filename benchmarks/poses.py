@@ -13,8 +13,8 @@ from lab import SceneBench, train_and_evaluate
 from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
 from numpy.typing import NDArray
 from report import Report, Row, page, table
+from trainers import Scene
 
-from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.scripts.command import run
 from mmpi_prepare.adjustment import degrees_between
 

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from lab import figure, train_and_evaluate
 from report import Bench, Report, Row, read_json, slug, stamp_line, table
+from trainers import Scene
 
-from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.scripts.command import run
 
 ROOT = Path(__file__).resolve().parents[1]

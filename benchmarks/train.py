@@ -11,9 +11,9 @@ import torch
 from methods import Method, find_method
 from report import Bench, Report, Row, slug, stamp
 from train_report import QUICK, draw, headline, markdown
+from trainers import Scene
 from trainings import Request, train_apart
 
-from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.scripts.command import run
 
 SHARES = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)

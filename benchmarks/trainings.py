@@ -25,9 +25,9 @@ from methods import Method
 from numpy.typing import NDArray
 from peers import give_depths, leave_lpips_out, look_up_quickly, read_points_ourselves
 from report import read_json, write_json
+from score import evenly
+from trainers import Scene, clock, config_of, trainer_of
 
-from mmpi_ns.bench.score import evenly
-from mmpi_ns.bench.trainers import Scene, clock, config_of, trainer_of
 from mmpi_ns.rendering.metrics import ImageMetrics
 
 PROGRESS = "progress.json"

@@ -22,7 +22,6 @@ COMMANDS = {
     "mmpi-plan": "mmpi_ns.scripts.plan",
     "mmpi-scene": "mmpi_scene.__main__",
     "mmpi-export": "mmpi_show.__main__",
-    "mmpi-bench": "mmpi_ns.scripts.bench",
 }
 CALM = {
     "machine.device_type": "cpu", "vis": "tensorboard", "max_num_iterations": 3, "experiment_name": "tiny",

@@ -27,8 +27,7 @@ COMPANIONS = {
 COMMANDS = {
     "functional": set(METHOD),
     "": {"functional"},
-    "bench": set(METHOD),
-    "scripts": {*METHOD, "bench"},
+    "scripts": set(METHOD),
 }
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
 MAY_IMPORT |= {wing: others | {wing} for wing, others in (COMMANDS | COMPANIONS).items()}

@@ -25,7 +25,7 @@ def test_every_command_says_the_version_of_pyproject(name, monkeypatch, capsys):
 
 
 def test_changelog_and_citation_are_of_this_version():
-    assert len(COMMANDS) == 5 and version("mmpi-ns") == VERSION
+    assert len(COMMANDS) == 4 and version("mmpi-ns") == VERSION
     newest = re.findall(r"^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)[0]
     cited = re.findall(r"^version: (\S+)", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
     assert [newest, *cited] == [VERSION, VERSION]

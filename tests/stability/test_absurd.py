@@ -12,8 +12,8 @@ import pytest
 import torch
 from methods import TWO_PHASE
 from still_life import still_life
+from trainers import Scene, config_of, train_words, trainer_of
 
-from mmpi_ns.bench.trainers import Scene, config_of, train_words, trainer_of
 from mmpi_ns.scene.plan import MPIPlan
 from mmpi_ns.training.trainer import MMPITrainer
 from mmpi_scene.dataset import write_dataset

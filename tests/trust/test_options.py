@@ -82,7 +82,6 @@ OTHER_COMMANDS = [
     *(("mmpi-scene street {out}", option, value) for option, value in (
         ("--width", "0"), ("--length", "nan"), ("--outliers", "2"),
     )),
-    ("mmpi-bench score --images {out} --data {out}", "--test-images", "-1"),
 ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""``mmpi-bench gpu``: check of training on this machine's GPU, in a minute or two."""
+"""Check of training on this machine's GPU, in a minute or two: ``python benchmarks/gpu_quick.py``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import platform
+import sys
 import warnings
 from dataclasses import dataclass
 from functools import partial
@@ -17,9 +18,10 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from trainers import JOINT, NO_TRACKS, P, Scene, Steps, train_words
 
-from mmpi_ns.bench.trainers import JOINT, NO_TRACKS, P, Scene, Steps, train_words
 from mmpi_ns.ops import dispatch
+from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.machine import processor
 
 DRIVER = Path("/proc/driver/nvidia/version")
@@ -28,11 +30,11 @@ STEPS, RAYS = 20, 1024
 
 
 @dataclass
-class Gpu:
+class GpuQuick:
     """Compares the kernels with plain torch on this machine, and times a step and a frame; without a GPU, those of the
     processor.
 
-    Comparisons with float64 and times of whole trainings: benchmarks/gpu.py and benchmarks/train.py of the repository.
+    Comparisons with float64 and times of whole trainings: benchmarks/gpu.py and benchmarks/train.py.
     """
 
     folder: Path = Path("outputs/gpu")
@@ -116,3 +118,7 @@ def time_training(device: str, data: Path, work: Path) -> dict[str, Any]:
     timed = {"step_ms": 1e3 * seconds, "rays": RAYS, "frame_ms": 1e3 * frame, "pixels": pixels, "differs": differs}
     peak = torch.cuda.max_memory_allocated() if device == "cuda" else 1024 * getrusage(RUSAGE_SELF).ru_maxrss
     return timed | {"peak_gib": peak / 2**30}
+
+
+if __name__ == "__main__":
+    sys.exit(run("gpu_quick", GpuQuick))
