@@ -50,6 +50,9 @@ HOPELESS, SHUFFLES = 0.004, 5
 comparison."""
 FOCAL_WRONG = 0.2
 """Log ratio of the fitted and the given focal length from which cameras are unusable."""
+SAME_PLACE = 1e-6
+"""Fraction of their distance from the origin below which cameras count as one place in float32: without epipolar
+lines."""
 FAR = 0.01
 """Distance from an epipolar line, relative to the image's width, at which errors are truncated in a fit."""
 
@@ -123,6 +126,17 @@ class Convention:
         return self.inverted or self.mirrored or not np.array_equal(self.axes, given)
 
 
+def misfit(poses: Array, lens: tuple[Array, Array, Array], matches: Matches) -> float:
+    """Median distance of matches from the epipolar lines of camera poses, OpenCV axes [M, 3, 4], over the width; NaN
+    without any.
+
+    Unlike reprojection errors of points it is not truncated: matches that fit the poses badly never become points.
+    """
+    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+    matrices[:, :3] = poses
+    return _Problem(matrices, lens, matches).judged(Convention(OPENCV)).error
+
+
 def find_convention(
     matrices: Array, given: Array, lens: tuple[Array, Array, Array], matches: Matches
 ) -> tuple[Convention, Convention | None, bool]:
@@ -175,16 +189,16 @@ class _Problem:
     """Distances of matches from the epipolar lines of cameras under a convention."""
 
     def __init__(self, matrices: Array, lens: tuple[Array, Array, Array], matches: Matches) -> None:
-        self.matches, (a, b) = matches, matches.images.T
+        self.matrices, self.lens, self.matches, (a, b) = matrices, lens, matches, matches.images.T
         self.over_width = lens[0][a]
         self.center = (lens[2] / lens[1])[matches.images]
         self.relative = {}
         for inverted in (False, True):
             poses = np.linalg.inv(matrices) if inverted else matrices
             pose = np.linalg.inv(poses[a]) @ poses[b]
-            with np.errstate(invalid="ignore", divide="ignore"):
-                shift = pose[:, :3, 3] / np.linalg.norm(pose[:, :3, 3], axis=-1, keepdims=True)
-            self.relative[inverted] = pose[:, :3, :3], shift
+            apart = np.linalg.norm(pose[:, :3, 3], axis=-1, keepdims=True)
+            apart[apart <= SAME_PLACE * max(1.0, float(np.abs(poses[:, :3, 3]).max()))] = np.nan
+            self.relative[inverted] = pose[:, :3, :3], pose[:, :3, 3] / apart
 
     def rays(self, convention: Convention) -> Array:
         """Rays of the matches. [N, 2, 3]"""
@@ -235,11 +249,8 @@ class _Problem:
 
     def fitted(self, readings: Sequence[Convention]) -> Convention:
         """The reading with the intrinsics that the matches fit best: the focal length, the lens, or both."""
-        few = max(1, len(self.matches.images) // 800)
-        thin = object.__new__(_Problem)
-        thin.matches = Matches(self.matches.images[::few], self.matches.rays[::few], self.matches.flat[::few])
-        thin.over_width, thin.center = self.over_width[::few], self.center[::few]
-        thin.relative = {k: (turns[::few], shifts[::few]) for k, (turns, shifts) in self.relative.items()}
+        few = np.s_[:: max(1, len(self.matches.images) // 800)]
+        thin = _Problem(self.matrices, self.lens, Matches(*(x[few] for x in vars(self.matches).values())))
         starts = [
             thin.judged(replace(r, focal=focal, moves_center=moves, bend=bend))
             for r in readings

@@ -100,13 +100,7 @@ def find_moving(
     near = [neighbours(images, i, keys) for i in range(len(shots))]
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
     nothing, first = masks.copy(), {}
-    known = float(np.median([valid_share(shot) for shot in shots]))
-    if known < KNOWN:
-        says = (
-            f"Nothing is masked, as other images confirm the depths of {known:.0%} of the textured pixels alone: too "
-            "few to tell motion from occlusion. People who walk along may be left in: take images closer together, or "
-            "mask them by hand (mask_path)."
-        )
+    if says := too_few_depths(shots):
         return [shot.view for shot in shots], nothing, says
 
     def look(i: int) -> tuple[Mask, _Look]:
@@ -165,10 +159,19 @@ def key_images(images: PosedImages, points_of: Callable[[int], NDArray[np.float6
     return keys
 
 
-def valid_share(shot: Shot) -> float:
-    """Share of the textured pixels of a shot that have a depth; 1 where there is no texture."""
-    textured = shot.view.inside & (mean_and_contrast(shot.view.gray)[1] > CONTRAST)
-    return float((shot.depth.inverse > 0)[textured].mean()) if textured.any() else 1.0
+def too_few_depths(shots: Sequence[Shot]) -> str:
+    """A sentence if so few of the textured pixels of shots have a depth that nothing is masked, else empty."""
+    shares = []
+    for shot in shots:
+        textured = shot.view.inside & (mean_and_contrast(shot.view.gray)[1] > CONTRAST)
+        shares.append(float((shot.depth.inverse > 0)[textured].mean()) if textured.any() else 1.0)
+    if (share := float(np.median(shares))) >= KNOWN:
+        return ""
+    return (
+        f"Nothing is masked, as other images confirm the depths of {share:.0%} of the textured pixels alone: too few "
+        "to tell motion from occlusion. People who walk along may be left in: take images closer together, or mask "
+        "them by hand (mask_path)."
+    )
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:

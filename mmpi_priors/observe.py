@@ -26,10 +26,10 @@ from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, quoted
 from mmpi_priors.cache import Arrays, kept
 from mmpi_priors.clouds import point_cloud, usable_points
-from mmpi_priors.conventions import OPENGL, Matches, find_convention, in_words
+from mmpi_priors.conventions import OPENGL, SAME_PLACE, Matches, find_convention, in_words
 from mmpi_priors.patches import search_surfaces
 from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
-from mmpi_priors.tracks import SAME_PLACE, triangulate
+from mmpi_priors.tracks import triangulate
 from mmpi_priors.views import load_view, pixel_grid
 
 MAX_REPROJECTION = 0.02

@@ -15,7 +15,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -101,6 +101,12 @@ def grouped(
     places = np.stack([np.median(change[part], 0) for part in order])
     count = len(order)
     return ColorRatios(np.full(count, first), np.full(count, second), medians, np.array(errors), places)
+
+
+def joined(parts: Iterable[ColorRatios | None]) -> ColorRatios | None:
+    """The ratios of several pairs of images; None if there are none."""
+    ratios = [part for part in parts if part is not None]
+    return ColorRatios(*map(np.concatenate, zip(*ratios, strict=True))) if ratios else None
 
 
 @dataclass(frozen=True)
@@ -194,12 +200,12 @@ def color_ratios(
         others = nearest_views(cameras.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, apart=False)
         return [pair_ratios(view, view_of(j), cameras, pixels, points) for j in others]
 
-    ratios: list[ColorRatios] = []
+    ratios: list[ColorRatios | None] = []
     for i, parts in enumerate(in_order(ratios_of, range(len(cameras.files)))):
-        ratios += [part for part in parts if part is not None]
+        ratios += parts
         if i % TRIMMED == 0:
             give_back_freed_memory()
-    return ColorRatios(*map(np.concatenate, zip(*ratios, strict=True))) if ratios else None
+    return joined(ratios)
 
 
 def solve(
@@ -247,31 +253,6 @@ def solve(
     return logs, np.sqrt(np.maximum(np.diag(covariance), 0)) * scale, solution[count : count + 2]
 
 
-def exposure_of_view(
-    view: ExposedView,
-    others: Sequence[ExposedView],
-    cameras: PosedImages,
-    pixels: Int[ndarray, "P 2"],
-    points: Float[ndarray, "P 3"],
-    exposures: Float[ndarray, "N 3"],
-    falloff: Float[ndarray, "2 3"],
-) -> Float[ndarray, "3"] | None:
-    """Exposure of an image that was not calibrated, by surfaces that calibrated images see too; None without any.
-
-    Args:
-        view, others: the image, and calibrated ones nearby.
-        cameras, exposures, falloff: of the calibrated images.
-        pixels, points: row and column of some of the image's pixels, and the points on their surfaces.
-    """
-    parts = [pair_ratios(view, other, cameras, pixels, points) for other in others]
-    ratios = [part for part in parts if part is not None]
-    if not ratios:
-        return None
-    joined = ColorRatios(*map(np.concatenate, zip(*ratios, strict=True)))
-    logs = np.log(exposures[joined.second]) - joined.log_ratios + joined.falloff @ falloff
-    return np.exp(np.median(logs, 0))
-
-
 def image_gains(ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] | None = None) -> Gains:
     """Gains of ``count`` images, with their error on held-out pairs of images."""
     pairs = np.minimum(ratios.first, ratios.second) * count + np.maximum(ratios.first, ratios.second)
@@ -297,13 +278,14 @@ def exposure_of_image(
     observed: Tensor,
     outputs: dict[str, Tensor],
 ) -> Tensor | None:
-    """Exposure of an evaluated image [3], by surfaces that training images near it see too; None without any.
+    """Exposure of an image that was not calibrated [3], by surfaces that training images near it see too; None without
+    any.
 
     Args:
         posed, dataset: the training images.
         factors: their exposures. [M, 3]
         falloff: of colours towards the corners. [2, 3]
-        camera: of the evaluated image.
+        camera: of the image.
         observed: its colours. [H, W, 3]
         outputs: its rendering, for the depths.
     """
@@ -320,6 +302,15 @@ def exposure_of_image(
     rays = camera.to("cpu").generate_rays(torch.zeros(len(pixels), 1, dtype=torch.long), coords=coords)
     depths = outputs["depth"].cpu()[pixels[:, 0], pixels[:, 1]]
     points = (rays.origins + rays.directions * depths).double().numpy()
-    exposures = factors.double().cpu().numpy(), falloff.double().cpu().numpy()
-    exposure = exposure_of_view(view, others, posed, pixels, points, *exposures)
-    return None if exposure is None else torch.from_numpy(exposure).float().to(factors)
+    ratios = joined(pair_ratios(view, other, posed, pixels, points) for other in others)
+    if ratios is None:
+        return None
+    exposure = exposure_by(ratios, *(x.double().cpu().numpy() for x in (factors, falloff)))
+    return torch.from_numpy(exposure).float().to(factors)
+
+
+def exposure_by(
+    ratios: ColorRatios, exposures: Float[ndarray, "N 3"], falloff: Float[ndarray, "2 3"]
+) -> Float[ndarray, "3"]:
+    """Exposure of the image that is the first of all pairs, by those of the second ones."""
+    return np.exp(np.median(np.log(exposures[ratios.second]) - ratios.log_ratios + ratios.falloff @ falloff, 0))

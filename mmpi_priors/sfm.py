@@ -70,19 +70,22 @@ def find_sfm_model(path: Path) -> SfmModel | None:
         sizes = [(cameras[image.camera_id].width, cameras[image.camera_id].height) for image in images]
     except (ValueError, TypeError, OSError, LookupError, MemoryError, AssertionError, struct.error) as error:
         raise InputError(f"The COLMAP model in {path} cannot be read ({brief(error)}): repair or remove it.") from error
-    good = [n for n, p in sorted(points.items()) if len(p.image_ids) >= MIN_TRACK and p.error <= MAX_ERROR_PX]
-    numbers = np.array(good, np.int64)
-    parts = [np.zeros((0, 4))]
-    for m, (image, size) in enumerate(zip(images, sizes, strict=True)):
-        ids = np.asarray(image.point3D_ids, np.int64)
-        rows = np.searchsorted(numbers, ids).clip(max=max(len(numbers) - 1, 0))
-        seen = numbers[rows] == ids if len(numbers) else np.zeros(len(ids), bool)
-        places = np.asarray(image.xys, np.float64).reshape(-1, 2)[seen] / size
-        parts.append(np.c_[np.full(len(places), m), rows[seen], places])
-    table = np.concatenate(parts)
-    seen_by, seen_point = table[:, :2].astype(np.int64).T
-    xyz = np.array([points[n].xyz for n in good], np.float64).reshape(-1, 3)
-    return SfmModel(xyz, np.array([image.name for image in images], np.str_), seen_by, seen_point, table[:, 2:])
+    good = {n: p.xyz for n, p in sorted(points.items()) if len(p.image_ids) >= MIN_TRACK and p.error <= MAX_ERROR_PX}
+    return _joined(good, [(x.name, np.array(s), x.xys, x.point3D_ids) for x, s in zip(images, sizes, strict=True)])
+
+
+def _joined(points: Mapping[int, Any], images: Sequence[tuple[str, NDArray[Any], Any, Any]]) -> SfmModel:
+    """A model of points [3] by their numbers, in order, and of each image its name, size, keypoints [N, 2] in pixels
+    and the points that these see [N], of which others are left out."""
+    numbers, parts = np.array(list(points), np.int64), [np.zeros((0, 4))]
+    for m, (_, size, places, ids) in enumerate(images):
+        seen = np.isin(np.asarray(ids, np.int64), numbers)
+        rows = np.searchsorted(numbers, np.asarray(ids, np.int64)[seen])
+        places = np.asarray(places, np.float64).reshape(-1, 2)[seen] / size
+        parts.append(np.c_[np.full(len(rows), m), rows, places])
+    table, xyz = np.concatenate(parts), np.array(list(points.values()), np.float64).reshape(-1, 3)
+    names, (seen_by, seen_point) = np.array([name for name, *_ in images], np.str_), table[:, :2].astype(np.int64).T
+    return SfmModel(xyz, names, seen_by, seen_point, table[:, 2:])
 
 
 def load_pycolmap() -> ModuleType:
@@ -105,21 +108,14 @@ def load_pycolmap() -> ModuleType:
 def read_reconstruction(model: pycolmap.Reconstruction, min_track: int = MIN_TRACK) -> SfmModel:
     """Well-observed points of a reconstruction, of at least ``min_track`` images, and their keypoints."""
     # In the order of the ids: that of the model itself may differ from one reading to the next.
-    good = [i for i, p in sorted(model.points3D.items()) if p.track.length() >= min_track and p.error <= MAX_ERROR_PX]
-    row = {point: n for n, point in enumerate(good)}
-    points = np.array([model.points3D[i].xyz for i in good], dtype=np.float64).reshape(-1, 3)
-    images = [image for _, image in sorted(model.images.items())]
-    keypoints = []
-    for m, image in enumerate(images):
-        camera = model.cameras[image.camera_id]
-        for p in image.points2D:
-            if p.has_point3D() and p.point3D_id in row:
-                x, y = p.xy
-                keypoints.append((m, row[p.point3D_id], x / camera.width, y / camera.height))
-    table = np.array(keypoints, dtype=np.float64).reshape(-1, 4)
-    names = np.array([image.name for image in images], dtype=np.str_)
-    seen_by, seen_point = table[:, :2].astype(np.int64).T
-    return SfmModel(points, names, seen_by, seen_point, table[:, 2:])
+    points = sorted(model.points3D.items())
+    good = {i: p.xyz for i, p in points if p.track.length() >= min_track and p.error <= MAX_ERROR_PX}
+    images = []
+    for _, image in sorted(model.images.items()):
+        camera, seen = model.cameras[image.camera_id], [p for p in image.points2D if p.has_point3D()]
+        size, ids = np.array([camera.width, camera.height]), [p.point3D_id for p in seen]
+        images.append((image.name, size, [p.xy for p in seen], ids))
+    return _joined(good, images)
 
 
 def numbers_in_model(files: Sequence[Path], names: Sequence[str]) -> NDArray[np.int64]:

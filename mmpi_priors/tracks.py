@@ -10,7 +10,6 @@ import os
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +19,13 @@ from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import opened
 from mmpi_priors import sfm
-from mmpi_priors.conventions import FINE, Matches
+from mmpi_priors.conventions import FINE, Matches, misfit
 from mmpi_priors.sfm import SfmModel, load_pycolmap, read_reconstruction
 
 NEIGHBOURS = 8
 """Maximum number of images that each image is matched with: the nearest with a similar viewing direction."""
 SMALL, LARGE = 800, 1600
 """Images up to the first size are doubled to find fine features; images above the second are reduced to it."""
-SAME_PLACE = 1e-6
-"""Fraction of their distance from the origin below which cameras count as one place in float32."""
 MAX_ANGLE = 60.0
 """Maximum angle in degrees between the viewing directions of matched images."""
 MIN_TRACK = 2
@@ -90,6 +87,7 @@ def triangulate(images: PosedImages) -> SfmModel:
         names = _gathered(images.files, work)
         pairs = [(names[i], names[j]) for i, j in near_pairs(images.camera_to_worlds, NEIGHBOURS)]
         opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
+        lens = images.intrinsics[:, 0] / images.sizes[:, 0], images.intrinsics[:, :2], images.intrinsics[:, 2:]
         poses = dict(zip(names, map(sfm.rigid3d, opencv), strict=True))
         for contrast, guided, least in EFFORTS:
             if tracks is not None and len(tracks.seen_by) >= ENOUGH * len(names):
@@ -104,7 +102,7 @@ def triangulate(images: PosedImages) -> SfmModel:
                     raise InputError(f"Image {file} cannot be read ({why}): repair it or leave it out.")
             if pairs:
                 sfm.match_pairs(database, pairs, guided=guided, least=least)
-                error = _epipolar_error(database, model)
+                error = misfit(opencv, lens, Matches.of(model, database))
                 model = sfm.triangulate_points(model, database, work, pairs_alone=True)
             tracks = read_reconstruction(model, MIN_TRACK)
         posed = sfm.new_model(cameras, names, range(1, len(names) + 1), poses)
@@ -116,24 +114,3 @@ def triangulate(images: PosedImages) -> SfmModel:
     table = np.concatenate([matches.images, *(x.reshape(-1, 4) for x in (matches.rays, matches.flat))], -1)
     order = np.array([str(names.index(name)) for name in tracks.names], np.str_)
     return replace(tracks, names=order, off=error, matches=table)
-
-
-def _epipolar_error(database: Path, model: Any) -> float:
-    """Median distance of the verified matches from the epipolar lines of a model's poses, relative to the width.
-
-    Unlike reprojection errors of points it is not truncated: matches that fit the poses badly never become points.
-    Images of one place have no epipolar lines; NaN without others.
-    """
-    pycolmap, distances = load_pycolmap(), []
-    cameras = {i: model.cameras[image.camera_id] for i, image in model.images.items()}
-    with pycolmap.Database.open(database) as opened:
-        keypoints = {i: np.asarray(opened.read_keypoints(i), np.float64).reshape(-1, 6)[:, :2] for i in model.images}
-    rays = {i: np.asarray(cameras[i].cam_from_img(points)) for i, points in keypoints.items()}
-    centers = {i: image.projection_center() for i, image in model.images.items()}
-    least = SAME_PLACE * max(1.0, float(np.abs(list(centers.values())).max()))
-    for a, b, matches in sfm.verified_matches(database):
-        if np.linalg.norm(centers[a] - centers[b]) <= least:
-            continue
-        distance = sfm.epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
-        distances.append(distance * cameras[a].mean_focal_length() / cameras[a].width)
-    return float(np.median(np.concatenate(distances))) if sum(map(len, distances)) else np.nan

@@ -5,14 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, expose, write_scene
+from tiny_scene import HEIGHT, TEST, TRAIN, WALL, WIDTH, color_of, expose, on_wall, write_scene
 from training_runs import datamanager, in_capture_frame
 
 from mmpi_ns.data.datamanager import CAPTURE
-from mmpi_ns.data.posed_images import posed_images
-from mmpi_ns.rendering.rendered import Exposures
 from mmpi_ns.training.losses import photometric
-from mmpi_priors.photometry import ExposedView, exposure_of_view
 
 FACTORS = np.random.default_rng(3).uniform(0.55, 1.0, (8, 3))
 
@@ -54,27 +51,23 @@ def test_colours_of_the_field_fit_its_range(manager):
 
 
 def test_exposure_of_an_image_without_calibration_is_that_of_what_it_shows(manager):
-    cameras = posed_images(manager.observations, manager.train_dataset)
-    number, held_out = 2, TRAIN[2]
-    truth = FACTORS[held_out] / np.exp(np.log(FACTORS[list(TRAIN)]).mean(0))
-    views = [view_of(manager, j) for j in range(len(TRAIN))]
-    pixels = np.argwhere(views[number].exposed & (manager.priors.depths.image(number)[..., 0] > 0))
-    rays = manager.train_ray_generator(torch.from_numpy(np.insert(pixels, 0, number, 1)))
-    distances = 1 / manager.priors.depths.image(number)[pixels[:, 0], pixels[:, 1], :1]
-    points = (rays.origins.double() + rays.directions.double() * torch.from_numpy(distances)).numpy()
-    others = [view for j, view in enumerate(views) if j != number]
-    found = exposure_of_view(
-        views[number], others, cameras, pixels, points, manager.priors.gains.factors, manager.priors.gains.falloff
-    )
+    """Rendered with the depths of its pixels, which are those of the wall."""
+    camera, data = manager.eval_dataset.cameras[0:1], manager.eval_dataset[0]
+    rays = camera.generate_rays(0)
+    scale = manager.train_dataparser_outputs.dataparser_scale
+    origins, directions = (x.double().numpy() for x in (rays.origins, rays.directions))
+    origins, directions = in_capture_frame(manager, origins.reshape(-1, 3), directions.reshape(-1, 3))
+    distance = (WALL - origins[:, 2]) / directions[:, 2]
+    shown = on_wall(*(origins + distance[:, None] * directions)[:, :2].T)
+    images = (torch.from_numpy(x.reshape(HEIGHT, WIDTH, 1)).float() for x in (scale * distance, shown))
+    outputs = dict(zip(("depth", "accumulation"), images, strict=True))
+    gains = manager.priors.gains.factors, manager.priors.gains.falloff
+    given = *map(torch.from_numpy, gains), camera, data["image"]
+    found = manager.maker.exposure_of(manager.observations, *given, outputs)
+    truth = FACTORS[TEST[0]] / np.exp(np.log(FACTORS[list(TRAIN)]).mean(0))
     np.testing.assert_allclose(found, truth, rtol=0.06)
-    assert (
-        exposure_of_view(views[0], [], cameras, pixels, points, manager.priors.gains.factors, np.zeros((2, 3))) is None
-    )
-
-
-def view_of(manager, i):
-    image = manager.train_dataset.get_data(i, image_type="uint8")["image"].numpy()
-    return ExposedView.of(image, np.ones((HEIGHT, WIDTH), np.uint8), None, i)
+    nothing = outputs | {"accumulation": torch.zeros(HEIGHT, WIDTH, 1)}
+    assert manager.maker.exposure_of(manager.observations, *given, nothing) is None
 
 
 def test_the_loss_is_that_in_the_image():
@@ -82,13 +75,3 @@ def test_the_loss_is_that_in_the_image():
     exposure = torch.tensor([[2.0, 1.0, 0.5]])
     expected = ((exposure * (predicted - observed)) ** 2).mean()
     assert photometric(predicted, observed, exposure).item() == pytest.approx(expected.item())
-
-
-def test_exposures_travel_with_a_checkpoint(manager):
-    model, other = Exposures(manager.priors.gains), Exposures(None)
-    other.load_state_dict(model.state_dict())
-    torch.testing.assert_close(other.factors, model.factors)
-    torch.testing.assert_close(other.mean, model.factors.log().mean(0).exp())
-    fresh = Exposures(None)
-    fresh.load_state_dict({})
-    assert fresh.mean is None

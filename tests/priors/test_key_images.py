@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from hand_made import posed
 
-from mmpi_priors import moving
 from mmpi_priors.dense import Depth
-from mmpi_priors.moving import find_moving, key_images
+from mmpi_priors.moving import key_images, too_few_depths
 from mmpi_priors.moving_evidence import Shot
 from mmpi_priors.views import View
 
@@ -40,21 +39,13 @@ def test_key_images_are_as_far_apart_as_asked():
     assert key_images(aside(0, 0.5, 0, 0, 0), lambda i: wall(), 0.025) == [0, 1, 2, 4]
 
 
-@pytest.mark.parametrize(("known", "is_told"), [(0.45, False), (0.55, True)])
-def test_nothing_is_masked_where_most_depths_are_unknown(monkeypatch, known, is_told):
+@pytest.mark.parametrize(("depths", "is_enough"), [(0.45, False), (0.55, True)])
+def test_where_most_depths_are_unknown_nothing_can_be_told(depths, is_enough):
     """Of the textured half of the images; the plain half, which cannot be matched, does not count."""
     gray = np.zeros((50, 100), np.uint8)
     gray[:, :50] = np.random.default_rng(0).integers(0, 255, (50, 50))
     inverse = np.zeros((50, 100), np.float32)
-    inverse[: round(50 * known)] = 1
+    inverse[: round(50 * depths)] = 1
     view = View(gray, np.ones(4), np.eye(4)[:3], np.ones((50, 100), bool))
-    shot = Shot(view, np.zeros((50, 100, 3), np.uint8), Depth(inverse, inverse), None)
-    monkeypatch.setattr(moving, "find_depths", lambda images, *_: iter([shot] * len(images.files)))
-    monkeypatch.setattr(moving, "_moves", lambda *_: (np.ones((50, 100), bool), None))
-    for name in ("_followed_on", "_outlined"):
-        monkeypatch.setattr(moving, name, lambda shots, near, masks, *_: masks)
-    assert moving.valid_share(shot) == pytest.approx(known, abs=0.02)
-    _, masks, doubt = find_moving(aside(*np.arange(5) * 0.02), lambda i: wall())
-    assert all(mask.any() == is_told for mask in masks)
-    said = f"confirm the depths of {moving.valid_share(shot):.0%} of the textured pixels alone"
-    assert (said in doubt and "People who walk along may be left in" in doubt) == (not is_told)
+    said = too_few_depths([Shot(view, np.zeros((50, 100, 3), np.uint8), Depth(inverse, inverse), None)] * 5)
+    assert bool(said) != is_enough and (is_enough or "People who walk along may be left in" in said)
