@@ -19,17 +19,16 @@ import pycolmap
 from filelock import FileLock, Timeout
 from scipy.cluster.hierarchy import DisjointSet
 
-from mmpi_ns.utils.errors import FULL, InputError, log, looked_at, progress, quoted
+from mmpi_ns.utils.errors import FULL, InputError, log, progress, quoted
 from mmpi_ns.utils.files import whole, write_text
-from mmpi_ns.utils.values import check_options
 from mmpi_prepare import checks, export, features, images, panoramas
 from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_known_poses
 from mmpi_prepare.depths import find_depths, metres_of, write_depths
 from mmpi_prepare.gps import Fit, find_fit
 from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_prepare.mapping import Task, map_and_judge
-from mmpi_prepare.poses import GIVEN_COUNTS, agreeing, make_cameras, opencv_camera, read_poses
-from mmpi_prepare.settings import RANGES, Settings, read_lists
+from mmpi_prepare.poses import agreeing, make_cameras, opencv_camera, read_poses
+from mmpi_prepare.settings import Settings, check, read_lists
 from mmpi_prepare.verdict import Verdict, remedy
 from mmpi_priors.sfm import load_pycolmap, match_pairs, new_model, quiet, rigid3d
 from mmpi_priors.tracks import near_pairs
@@ -401,31 +400,8 @@ def prepare(s: Settings) -> Verdict:
     is missing, or something would be lost in the scene's folder; later, if the input cannot be made into a scene.
     """
     load_pycolmap()  # in a version that is new enough
-    check_options(s, {name: number for name, number in RANGES.items() if getattr(s, name) is not None}, "--")
-    every, threads = (s.test_every, s.train_every), s.threads
-    source, scene, kinds = s.input.resolve(), s.scene.resolve(), " or ".join(GIVEN_COUNTS.values())
-    camera = (1.0,) * 4 if s.camera is None else s.camera
-    focals = camera[: 1 if len(camera) == 3 else 2]
-    faults = {
-        f"--camera takes {kinds}, not {len(camera)} numbers.": len(camera) not in GIVEN_COUNTS,
-        "--camera: focal lengths must be positive, in pixels.": min(focals, default=1) <= 0,
-        "--focal and --camera both give a focal length: leave one out.": None not in (s.focal, s.camera),
-        "--test-every and --train-every contradict each other: leave one out.": None not in every,
-        f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.": (s.test_every or 2) < 2,
-        f"--downscales takes different numbers, not {s.downscales}.": len(set(s.downscales)) < len(s.downscales),
-        f"--threads takes a number of threads, or -1 for all cores, not {threads}.": threads < 1 and threads != -1,
-        "--refine-poses refines known poses: give them with --poses.": s.refine_poses and s.poses is None,
-        f"--poses {s.poses} does not exist.": s.poses is not None and not s.poses.exists(),
-        f"--masks {s.masks} is no folder.": s.masks is not None and not s.masks.is_dir(),
-        f"--depths {s.depths} is no folder.": s.depths is not None and not s.depths.is_dir(),
-        "--depths are of images with their lens: leave --undistort out.": s.depths is not None and s.undistort,
-        f"There is no {looked_at(s.input)}: check the path.": not source.exists(),
-        f"{s.scene} is a file: name a folder for the scene.": s.scene.is_file(),
-    }
-    for says in (says for says, is_wrong in faults.items() if is_wrong):
-        raise InputError(says)
-    if s.split_from is not None:
-        read_lists(s.split_from)
+    check(s)
+    source, scene = s.input.resolve(), s.scene.resolve()
     taken = export.existing_parts(scene)
     if scene == source or source in scene.parents or any((scene / part) in (source, *source.parents) for part in taken):
         raise InputError(f"The scene {s.scene} would be mixed with its input: name another folder.")

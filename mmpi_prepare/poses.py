@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -120,10 +121,7 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
         _check_apart(chosen, path)
         poses = {}
         for name, file in chosen.items():
-            try:
-                matrix = np.loadtxt(file, dtype=np.float64)
-            except ValueError as error:
-                raise InputError(f"{file} cannot be read ({error}).") from error
+            matrix = _read_numbers(file)
             if matrix.shape not in ((4, 4), (3, 4)):
                 raise InputError(f"{file} is {matrix.shape}, not 4x4.")
             poses[name] = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
@@ -173,36 +171,37 @@ def agreeing(known: KnownPoses, model: pycolmap.Reconstruction, database: Path) 
     return replace(known, poses=dict(zip(names, better.applied(matrices), strict=True)), says=f"{known.says}. {says}")
 
 
+def _read_numbers(file: Path) -> Array:
+    """The lines of a text file, in which # begins a comment. [lines, numbers]"""
+    text = file.read_text(encoding="utf-8", errors="replace").replace(",", " ")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a file without numbers
+            return np.loadtxt(text.splitlines(), dtype=np.float64, ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{file} cannot be read ({error}).") from error
+
+
 def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """Poses in the lines of a text file, in which # begins a comment.
 
     KITTI: 12 numbers, a line for each image; of more lines, the numbers in the file names choose (counted from 0). TUM:
     8 numbers, by time stamp if the file names are time stamps, else a line for each image.
     """
-    text = path.read_text(encoding="utf-8", errors="replace")
-    lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
-    width, rows = len(next(filter(None, lines), [])), []
+    numbers = _read_numbers(path)
+    rows, width = numbers.shape
     if width not in (8, 12):
         formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
         raise InputError(f"--poses {path} is not understood: {formats}.")
-    for number, fields in enumerate(lines, 1):
-        if not fields:
-            continue
-        try:
-            rows.append([float(f) for f in fields])
-        except ValueError as error:
-            raise InputError(f"{path}, line {number}: {error}.") from error
-        if len(fields) != width:
-            raise InputError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
-    numbers, poses = np.array(rows, dtype=np.float64), np.tile(np.eye(4), (len(rows), 1, 1))
+    poses = np.tile(np.eye(4), (rows, 1, 1))
     places, says = list(range(len(photos))), "one line for each image"
     if width == 12:
         poses[:, :3] = numbers.reshape(-1, 3, 4)
-        if len(rows) != len(photos):
+        if rows != len(photos):
             digits = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
             places = [int(d[-1]) for d in digits if d]
-            if len(rows) < len(photos) or len(set(places)) < len(photos) or max(places) >= len(rows):
-                raise InputError(f"{path} has {len(rows)} poses for {len(photos)} images: they cannot be matched.")
+            if rows < len(photos) or len(set(places)) < len(photos) or max(places) >= rows:
+                raise InputError(f"{path} has {rows} poses for {len(photos)} images: they cannot be matched.")
             says = "the lines that the images' numbers name (from 0)"
         return KnownPoses({p.name: poses[i] for p, i in zip(photos, places, strict=True)}, f"KITTI poses, {says}")
     for pose, row in zip(poses, numbers, strict=True):
@@ -217,9 +216,9 @@ def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
             matched[photo.name] = poses[lags.argmin()]
     if 2 * len(matched) >= len(photos):
         return KnownPoses(matched, f"TUM poses, matched by time stamp within {MAX_LAG} s")
-    if len(rows) != len(photos):
+    if rows != len(photos):
         raise InputError(
-            f"{path} has {len(rows)} poses for {len(photos)} images, and the images' names are not their time stamps."
+            f"{path} has {rows} poses for {len(photos)} images, and the images' names are not their time stamps."
         )
     return KnownPoses({p.name: pose for p, pose in zip(photos, poses, strict=True)}, f"TUM poses, {says}")
 

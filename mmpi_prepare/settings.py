@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mmpi_ns.utils.errors import InputError
-from mmpi_ns.utils.values import Number
+from mmpi_ns.utils.errors import InputError, looked_at
+from mmpi_ns.utils.values import Number, check_options
 from mmpi_prepare.features import Matching
-from mmpi_prepare.poses import Lens, Sharing
+from mmpi_prepare.poses import GIVEN_COUNTS, Lens, Sharing
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,35 @@ RANGES = {
     **dict.fromkeys(("train_every", "max_frames", "downscales"), Number(2, whole=True)),
     "camera": Number(),
 }
+
+
+def check(s: Settings) -> None:
+    """Raises InputError if an option is out of range, contradicts another or names no file."""
+    check_options(s, {name: number for name, number in RANGES.items() if getattr(s, name) is not None}, "--")
+    every, threads = (s.test_every, s.train_every), s.threads
+    kinds = " or ".join(GIVEN_COUNTS.values())
+    camera = (1.0,) * 4 if s.camera is None else s.camera
+    focals = camera[: 1 if len(camera) == 3 else 2]
+    faults = {
+        f"--camera takes {kinds}, not {len(camera)} numbers.": len(camera) not in GIVEN_COUNTS,
+        "--camera: focal lengths must be positive, in pixels.": min(focals, default=1) <= 0,
+        "--focal and --camera both give a focal length: leave one out.": None not in (s.focal, s.camera),
+        "--test-every and --train-every contradict each other: leave one out.": None not in every,
+        f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.": (s.test_every or 2) < 2,
+        f"--downscales takes different numbers, not {s.downscales}.": len(set(s.downscales)) < len(s.downscales),
+        f"--threads takes a number of threads, or -1 for all cores, not {threads}.": threads < 1 and threads != -1,
+        "--refine-poses refines known poses: give them with --poses.": s.refine_poses and s.poses is None,
+        f"--poses {s.poses} does not exist.": s.poses is not None and not s.poses.exists(),
+        f"--masks {s.masks} is no folder.": s.masks is not None and not s.masks.is_dir(),
+        f"--depths {s.depths} is no folder.": s.depths is not None and not s.depths.is_dir(),
+        "--depths are of images with their lens: leave --undistort out.": s.depths is not None and s.undistort,
+        f"There is no {looked_at(s.input)}: check the path.": not s.input.exists(),
+        f"{s.scene} is a file: name a folder for the scene.": s.scene.is_file(),
+    }
+    for says in (says for says, is_wrong in faults.items() if is_wrong):
+        raise InputError(says)
+    if s.split_from is not None:
+        read_lists(s.split_from)
 
 
 def read_lists(path: Path) -> dict[str, list[str]]:

@@ -100,7 +100,8 @@ def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_pa
     ("text", "words"),
     [
         ("1 2 3\n", "not understood"),
-        ("1 0 0 0 0 1 0 0 0 0 1 x\n", "line 1"),
+        ("1 0 0 0 0 1 0 0 0 0 1 x\n", "'x' to float64 at row 0"),
+        ("# nothing", "not understood"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "3 poses for 8 images"),
         ("2 0 0 0 0 2 0 0 0 0 2 0\n" * 8, "no rotation"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n" * 8, "no rotation"),
