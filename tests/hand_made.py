@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
@@ -36,14 +37,8 @@ def samples_to_ndc(origins, directions, inverse_t, frames):
 
 
 def rotation(quaternion):
-    """Rows of the rotation of a quaternion (need not be normalised)."""
-    w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return tuple(tuple(float(v) for v in row) for row in rows)
+    """Rows of the rotation of a quaternion w, x, y, z (need not be normalised)."""
+    return tuple(map(tuple, Rotation.from_quat(np.roll(quaternion, -1)).as_matrix().tolist()))
 
 
 def random_mpi(rng, name="random", planes=None, deep=math.inf):

@@ -9,8 +9,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 28.0
 WALL = -4.0
@@ -119,15 +121,10 @@ def equidistant(points):
 
 
 def undistort(x, y, lens):
-    """Tangents whose OpenCV distortion (k1, k2, p1, p2) falls on (x, y), y down, by fixed-point iteration."""
-    k1, k2, p1, p2 = lens
-    u, v = x.copy(), y.copy()
-    for _ in range(60):
-        r2 = u * u + v * v
-        radial = 1 + k1 * r2 + k2 * r2 * r2
-        left, down = x - 2 * p1 * u * v - p2 * (r2 + 2 * u * u), y - p1 * (r2 + 2 * v * v) - 2 * p2 * u * v
-        u, v = left / radial, down / radial
-    return u, v
+    """Tangents whose OpenCV distortion (k1, k2, p1, p2) falls on (x, y), y down."""
+    points, whole = np.stack([x, y], -1).reshape(-1, 1, 2), np.eye(3)
+    found = cv2.undistortPointsIter(points, whole, np.array([*lens]), whole, whole, (3, 60, 1e-12))
+    return np.moveaxis(found.reshape(*x.shape, 2), -1, 0)
 
 
 def wall_points():
@@ -152,7 +149,7 @@ def write_colmap(folder: Path) -> None:
     for i in range(8):
         # World to camera with y down and z ahead.
         rotation = np.diag([1.0, -1, -1]) @ pose_of(i)[:3, :3].T
-        x, y, z, w = _quaternion(rotation)
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
         shift = -rotation @ pose_of(i)[:3, 3]
         lines.append(" ".join(str(float(v)) for v in (w, x, y, z, *shift)).join([f"{i + 1} ", f" 1 {name_of(i)}"]))
         pixels, seen = project(i, points)
@@ -167,20 +164,3 @@ def write_colmap(folder: Path) -> None:
         for p, t in sorted(tracks.items())
     ]
     (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
-
-
-def _quaternion(rotation):
-    """(x, y, z, w) of a rotation matrix."""
-    best, found = -1.0, None
-    for i, signs in enumerate([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]):
-        trace = 1 + float(np.dot(signs, np.diag(rotation)))
-        if trace > best:
-            best, found = trace, i
-    r, s = rotation, 2 * np.sqrt(best)
-    pairs = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
-    sums = {(0, 1): r[0, 1] + r[1, 0], (0, 2): r[0, 2] + r[2, 0], (1, 2): r[1, 2] + r[2, 1]}
-    if found == 0:
-        return (*(p / s for p in pairs), s / 4)
-    k = found - 1
-    values = [s / 4 if j == k else sums[tuple(sorted((j, k)))] / s for j in range(3)]
-    return (*values, pairs[k] / s)

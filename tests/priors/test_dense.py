@@ -7,13 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
-from mmpi_priors import dense
 from mmpi_priors.dense import Depth, confirmed, find_depths
-from mmpi_priors.ops.matches import average_matches
 from mmpi_priors.views import camera_matrix, load_view, project
 
 F32 = np.float32
@@ -101,18 +98,6 @@ def test_a_wrong_pose_gives_few_depths(tmp_path):
     wrong = list(find_depths(replace(images, camera_to_worlds=moved), lambda i: points_on_walls(POSES[i]), WIDTH))
     known = [sum((d.inverse > 0).sum() for _, d in f) for f in (right, wrong)]
     assert known[1] < 0.3 * known[0]
-
-
-def mean_of(values, weights):
-    """The mean of measurements of one pixel, and its error."""
-    columns = (torch.tensor(each).reshape(-1, 1, 1) for each in (values, weights))
-    return tuple(x.item() for x in average_matches(*columns, dense.MAX_RELATIVE))
-
-
-def test_measurements_that_agree_are_averaged_by_certainty():
-    inverse, error = mean_of((1.0, 1.005, 3.0), (1e4, 4e4, 1e8))
-    assert inverse == pytest.approx((1.0 + 4 * 1.005) / 5)
-    assert error == pytest.approx(np.sqrt(1 / 5e4))
 
 
 def flat_view(tmp_path, pose, gray=128):

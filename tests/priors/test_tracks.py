@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from corridor import noise
@@ -14,6 +15,7 @@ from tiny_scene import undistort
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors.observe import with_tracks
 from mmpi_priors.tracks import triangulate
+from mmpi_priors.views import camera_matrix
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 180.0
 LENS = (0.05, -0.02, 0.001, -0.002)
@@ -33,13 +35,9 @@ def is_near_wall(points):
 
 
 def undistort_fisheye(x, y, lens):
-    """Directions whose fisheye projection (angle a at radius a (1 + k1 a^2 + ... + k4 a^8)) falls on (x, y)."""
-    radius = np.hypot(x, y)
-    angle = radius.copy()
-    for _ in range(30):
-        angle = radius / (1 + sum(k * angle ** (2 * n + 2) for n, k in enumerate(lens)))
-    stretch = np.tan(angle) / radius
-    return x * stretch, y * stretch
+    """The same of OpenCV's fisheye."""
+    points = np.stack([x, y], -1).reshape(-1, 1, 2)
+    return np.moveaxis(cv2.fisheye.undistortPoints(points, np.eye(3), np.array(lens)).reshape(*x.shape, 2), -1, 0)
 
 
 def picture(pose, lens, fisheye=False):
@@ -109,15 +107,11 @@ def keypoints_of(model, images):
 def test_keypoints_are_where_the_points_project(images, model):
     cameras, points, relative = keypoints_of(model, images)
     assert len(cameras) >= 3 * len(model.points)
-    poses = images.camera_to_worlds[cameras]
-    local = np.einsum("qji,qj->qi", poses[:, :, :3], model.points[points] - poses[:, :, 3])
-    x, y = local[:, 0] / -local[:, 2], local[:, 1] / local[:, 2]
-    k1, k2, p1, p2 = LENS
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2 * r2
-    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    pixels = np.stack([u * FOCAL + WIDTH / 2, v * FOCAL + HEIGHT / 2], -1)
+    pixels = np.zeros(relative.shape)
+    for i, pose in enumerate(images.camera_to_worlds):
+        seen = (model.points[points[cameras == i]] - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]
+        still, matrix = np.zeros(3), camera_matrix(images.intrinsics[i])
+        pixels[cameras == i] = cv2.projectPoints(seen, still, still, matrix, np.array(LENS))[0][:, 0]
     error = np.linalg.norm(pixels - relative * [WIDTH, HEIGHT], axis=-1)
     assert np.median(error) < 0.5 and error.max() < 6
 

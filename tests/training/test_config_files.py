@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup
-from training_runs import datamanager, ready, trainer_config
+from training_runs import ready, trainer_config
 
 from mmpi_ns.config import mmpi_kitti, mmpi_small
-from mmpi_ns.utils.errors import InputError
 
 
 @pytest.mark.parametrize("method", [mmpi_small, mmpi_kitti])
@@ -33,9 +32,3 @@ def test_a_run_is_read_from_another_folder_than_it_was_trained_in(scene, plan_fi
     monkeypatch.chdir(tmp_path / "elsewhere")
     _, pipeline, checkpoint, step = eval_setup(tmp_path / "there" / config.get_base_dir() / "config.yml")
     assert step == 1 and checkpoint.parent.parent.parent.name == "mmpi-small" and len(pipeline.datamanager.eval_dataset)
-
-
-def test_a_capture_that_is_not_there_says_from_where_its_path_is_seen(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=rf"no data/transforms.json in {tmp_path}, from where the path is seen"):
-        datamanager(Path("data"))

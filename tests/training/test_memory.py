@@ -1,5 +1,4 @@
-"""What is said of a run: before it starts the memory that it takes (memory.py), and at its end how to go on; how
-many rays are rendered at once."""
+"""What is said of a run: before it starts the memory that it takes (memory.py), and at its end how to go on."""
 
 from __future__ import annotations
 
@@ -14,7 +13,6 @@ from hand_made import make_mpi
 from tiny_scene import TRAIN, WIDTH, image_of, write_scene
 from training_runs import datamanager, load, ready, trainer_config
 
-from mmpi_ns.rendering.images import BYTES_PER_SAMPLE, CPU_RAYS, FREE_SHARE, GPU_RAYS, rays_per_chunk
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training import memory, report
@@ -134,16 +132,3 @@ def test_the_next_commands_can_be_copied_from_any_folder():
     assert [shlex.split(line)[shlex.split(line).index("--load-config") + 1] for line in commands] == [
         "/my photos/r/config.yml"
     ] * 3
-
-
-@pytest.mark.parametrize("gib", [0.5, 2.0, 7.0, 24.0])
-@pytest.mark.parametrize("samples", [64, 256, 1024])
-def test_a_gpu_renders_what_half_of_its_free_memory_holds(monkeypatch, free, gib, samples):
-    free(gib)
-    for name in ("memory_reserved", "memory_allocated"):
-        monkeypatch.setattr(torch.cuda, name, lambda device: 2**30)
-    found = rays_per_chunk(samples, torch.device("cuda", 1))
-    room = FREE_SHARE * gib * 2**30 / (BYTES_PER_SAMPLE * samples)
-    assert found == GPU_RAYS or found == CPU_RAYS or found <= room < 2 * found
-    assert found > CPU_RAYS or room < 2 * CPU_RAYS
-    assert found < GPU_RAYS or room >= GPU_RAYS
