@@ -12,6 +12,6 @@ def __getattr__(name: str) -> Any:
     """``load``, imported when it is first accessed: torch and nerfstudio take seconds."""
     if name != "load":
         raise AttributeError(f"module 'mmpi_show' has no attribute '{name}'")
-    from mmpi_show.functional import load
+    from mmpi_show.files import load
 
     return load

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from mmpi_prepare.adjustment import similarity_between
+
 WIDTH, HEIGHT, FOCAL = 240, 160, 170.0
 EYE = 1.5
 PLANES = (  # axis, place, the two other axes
@@ -75,6 +77,15 @@ def write_images(folder: Path, count=14, seed=0, start=0, bend=0.01):
     for i, pose in enumerate(chosen):
         Image.fromarray(picture(pose, seed)).save(folder / f"frame_{start + i + 1:03d}.png")
     return chosen
+
+
+def error_of(names, found, count):
+    """Largest distance of the centres of poses [N, 4, 4] from the true ones of ``count`` frames, as a share of the
+    track."""
+    given = poses(count)[[int(Path(name).stem[-3:]) - 1 for name in names]]
+    moved = similarity_between(found, given)
+    off = [np.linalg.norm(moved * p - q) for p, q in zip(found[:, :3, 3], given[:, :3, 3], strict=True)]
+    return max(off) / np.linalg.norm(np.diff(given[:, :3, 3], axis=0), axis=-1).sum()
 
 
 def depth(pose):

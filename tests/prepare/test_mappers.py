@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from pathlib import Path
 
 import corridor
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 
 from mmpi_ns.utils.errors import InputError
 from mmpi_prepare import adjustment, mapping
-from mmpi_prepare.adjustment import camera_poses, similarity_between, with_all_points
+from mmpi_prepare.adjustment import camera_poses, with_all_points
 from mmpi_prepare.mapping import Task, map_and_judge
 from mmpi_prepare.pipeline import WORK, prepare
 from mmpi_prepare.settings import Settings
@@ -38,12 +37,7 @@ def task(matched, tmp_path):
 
 
 def error_of(model):
-    """Largest distance of the centres from the true ones, as a share of the track."""
-    names, poses = camera_poses(model)
-    given = corridor.poses(COUNT)[[int(Path(n).stem[-3:]) - 1 for n in names]]
-    moved = similarity_between(poses, given)
-    off = [np.linalg.norm(moved * p - q) for p, q in zip(poses[:, :3, 3], given[:, :3, 3], strict=True)]
-    return max(off) / np.linalg.norm(np.diff(given[:, :3, 3], axis=0), axis=-1).sum()
+    return corridor.error_of(*camera_poses(model), COUNT)
 
 
 def test_a_candidate_whose_lens_ends_within_its_images_is_judged(task):

@@ -1,4 +1,5 @@
-"""The version is one: of the package, of every command, of the changelog and of the citation."""
+"""The version is one, of the package, of every command, of the changelog and of the citation; and tables of README.md
+and docs/results are those that ``make results`` made."""
 
 from __future__ import annotations
 
@@ -8,8 +9,11 @@ from importlib.metadata import entry_points, version
 from pathlib import Path
 
 import pytest
+from report import read_json
+from results import finished, readme_table, results_page
 
 ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "results"
 PYPROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 VERSION = re.findall(r'^version = "(.*)"', PYPROJECT, re.MULTILINE)[0]
 COMMANDS = re.findall(r'^(mmpi-\w+) = "mmpi_\w+\.(?:__main__|scripts)', PYPROJECT, re.MULTILINE)
@@ -29,3 +33,12 @@ def test_changelog_and_citation_are_of_this_version():
     newest = re.findall(r"^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)[0]
     cited = re.findall(r"^version: (\S+)", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
     assert [newest, *cited] == [VERSION, VERSION]
+
+
+@pytest.mark.parametrize(("page", "make"), [("README.md", readme_table), ("docs/results/README.md", results_page)])
+def test_tables_are_those_that_were_measured(page, make):
+    content, scored = read_json(RESULTS / "results.json"), read_json(RESULTS / "score.json")
+    assert {row["commit"] for row in finished(content).values()} == {content["made"]["commit"]}
+    text = (ROOT / page).read_text(encoding="utf-8")
+    (table,) = re.findall(r"<!-- results -->\n\n(.*?)\n\n<!-- /results -->", text, re.DOTALL)
+    assert table == make(content, scored)
