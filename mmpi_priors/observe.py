@@ -71,7 +71,11 @@ def observe(
     data = Path(parser.data)
     folder = data.parent if data.suffix == ".json" else data
     model = find_sfm_model(folder / getattr(parser, "colmap_path", sfm_path))
-    observations = read_observations(outputs, dataset.cameras, model, point_cloud(outputs, parser))
+    observations, cloud = read_observations(outputs, dataset.cameras, model), point_cloud(outputs, parser)
+    if cloud is not None and len(observations.seen_by):
+        log_once("Point cloud: not used, because the SfM tracks record which images see each point.")
+    elif cloud is not None and len(loose := usable_points(cloud, observations.centers)):
+        observations = replace(observations, loose=loose)
     if np.ptp(observations.centers, axis=0).max() <= SAME_PLACE * max(1.0, np.abs(observations.centers).max()):
         CONSOLE.print("[bold yellow]All training cameras have the same position: depths cannot be learned.")
     if find_points:
@@ -79,9 +83,6 @@ def observe(
             check = partial(check_cameras, file_matrices(observations, outputs, folder), trusts=trusts)
             observations = _find_points(observations, dataset, triangulates, check)
         else:
-            if observations.loose is not None:
-                log_once("Point cloud: not used, because the SfM tracks record which images see each point.")
-                observations = replace(observations, loose=None)
             angles = keypoint_angles(observations, dataset.cameras)
             off = np.median(angles * observations.intrinsics[observations.seen_by, 0])
             tell_poses(float(off), Path(outputs.image_filenames[0]))
@@ -211,14 +212,10 @@ def tell_poses(off: float, image: Path) -> None:
     CONSOLE.print(f"{says}: {command} refines them.", style="bold yellow", markup=False, soft_wrap=True)
 
 
-def read_observations(
-    outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None, cloud: Array | None = None
-) -> Observations:
-    """Training cameras in the scene's frame, with the SfM points and keypoints in it, and the points of a cloud [P, 3].
-    Raises InputError naming the image whose pose or intrinsics cannot be used."""
+def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
+    """Training cameras in the scene's frame, with the SfM points and keypoints in it. Raises InputError naming the
+    image whose pose or intrinsics cannot be used."""
     observations = camera_observations(cameras, outputs.image_filenames)
-    if cloud is not None and len(loose := usable_points(cloud, observations.centers)):
-        observations = replace(observations, loose=loose)
     if sfm is None:
         return observations
     transform = outputs.dataparser_transform.double().numpy()

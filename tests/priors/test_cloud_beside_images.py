@@ -10,9 +10,9 @@ from tiny_scene import wall_points, write_scene
 from training_runs import datamanager
 
 
-def scene_with_points(folder, points):
-    """The tiny scene without a COLMAP model, and with these points in ``ply_file_path``; None: without any."""
-    data = write_scene(folder, sfm=False)
+def scene_with_points(folder, points, sfm=False):
+    """The tiny scene, without a COLMAP model unless asked for, with these points in ``ply_file_path``."""
+    data = write_scene(folder, sfm=sfm)
     if points is not None:
         head = "".join(f"property float {name}\n" for name in "xyz")
         rows = "".join(f"{x} {y} {z}\n" for x, y, z in points)
@@ -63,3 +63,11 @@ def test_a_cloud_gives_depths_where_images_are_not_matched(tmp_path):
     assert manager.priors.depths is not None and manager.priors.depths.share > 0.03
     manager.config.dataparser.load_3D_points = False
     assert manager.config.setup(device="cpu", test_mode="val").priors.depths is None
+
+
+def test_a_cloud_beside_tracks_is_said_to_be_unused_and_no_more(tmp_path, capsys):
+    """Also where single points are absurd, as in the cloud of a COLMAP model."""
+    data = scene_with_points(tmp_path / "scene", np.vstack([wall_points(), [[1e30, 0, 0]]]), sfm=True)
+    assert datamanager(data).observations.loose is None
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Point cloud: not used, because the SfM tracks" in said and "points of the point cloud" not in said
