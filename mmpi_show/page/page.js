@@ -170,9 +170,9 @@ class Page {
     return distances.indexOf(Math.min(...distances));
   }
 
-  turn(dx, dy) { // pixels of the screen
+  turn(dx, dy) { // pixels of the screen: to where one drags, as in nerfstudio's viewer
     this.playing = null;
-    const angle = this.camera.size[0] / this.camera.focal[0] / innerWidth, up = this.header.up;
+    const angle = -this.camera.size[0] / this.camera.focal[0] / innerWidth, up = this.header.up;
     let axes = this.camera.axes.map((axis) => rotated(axis, up, dx * angle));
     const tilted = axes.map((axis) => rotated(axis, axes[0], dy * angle));
     if (Math.abs(dot(tilted[2], up)) < 0.98) axes = tilted;
