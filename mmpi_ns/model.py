@@ -228,10 +228,7 @@ class MMPIModel(Model):
             raise InputError(f"An image of {width} x {height} pixels shows nothing: give a smaller --downscale-factor.")
         if obb_box is not None:
             return super().get_outputs_for_camera(camera, obb_box)
-        outputs = self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))
-        if current_thread() is not main_thread() and self.show.value == "all":  # the viewer's
-            self.path_controls.note(float((outputs["accumulation"] > 0.5).float().mean()))
-        return outputs
+        return self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))
 
     @torch.no_grad()
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:

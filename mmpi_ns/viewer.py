@@ -14,7 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
+from torch import Tensor
 from viser import CameraHandle, ClientHandle, ViserServer
+
+from mmpi_ns.training.frames import FrameThread
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
@@ -32,8 +35,6 @@ NEAREST = 0.02
 """Scene units; the page moves no nearer than half of it to that point."""
 PACE = 2.0
 """Distances of the first content that the wheel walks while the page would divide the distance ahead by e."""
-TARGET = 10
-"""Frames a second for which the viewer chooses the size of images while one moves (its own: 30, a blur on a CPU)."""
 FRAMES_PER_SECOND = 10.0
 """Poses that Play sends."""
 
@@ -95,7 +96,6 @@ class PathControls(ViewerElement[float], ViewerControl):
         super().__init__("Captured path", cb_hook=lambda _: None)
         self._path: CapturedPath | None = None
         self._walker: ClientHandle | None = None
-        self._little = False
 
     def install(self, viser_server: ViserServer) -> None:
         """Makes the controls; the viewer calls it inside the model's folder."""
@@ -117,11 +117,6 @@ class PathControls(ViewerElement[float], ViewerControl):
         self._half_height = float(cameras.cy[i] / cameras.fy[i])
         self._near: float = viewer.pipeline.model.progress.windows.plans[0].content_near  # type: ignore[union-attr]
         self._ahead = max(AHEAD * self._near, NEAREST)
-        # Above the tabs, where nothing is scrolled away.
-        gui = viewer.viser_server.gui
-        self._line = gui.add_markdown("Little was captured from here:", order=-2, visible=False)
-        self._back = gui.add_button("Back to the path", order=-1, visible=False)
-        self._back.on_click(self._go_to_nearest)
         # Whoever stands where a camera stood has its frustum, with a small copy of its image, before the eye.
         frusta = viewer.viser_server.scene.add_frame("/cameras", show_axes=False, visible=False)
         viewer.toggle_cameravis_button()
@@ -129,23 +124,23 @@ class PathControls(ViewerElement[float], ViewerControl):
         self._path, self._slider.value = path, i / max(len(path) - 1, 1)
         viewer.viser_server.on_client_connect(self._open)
 
-    def note(self, opaque: float) -> None:
-        """Is told the opaque share of an image that was shown, by the viewer's thread."""
-        if self._path is not None and self._little != (opaque < LITTLE):
-            # The viewer stops its own thread anywhere, also between two halves of a change.
-            Thread(target=self._offer, args=[opaque < LITTLE], daemon=True).start()
-
-    def _offer(self, little: bool) -> None:
-        self._little = self._line.visible = self._back.visible = little
-
     def _open(self, client: ClientHandle) -> None:
         assert self._path is not None
-        self.viewer.render_statemachines[client.client_id].target_fps = TARGET
-        aspect, walked = 0.0, 0.0
+        viewer, aspect, walked = self.viewer, 0.0, 0.0
+        model: Any = viewer.get_model()
+        # Above the tabs, where nothing is scrolled away.
+        line = client.gui.add_markdown("Little was captured from here:", order=-2, visible=False)
+        back = client.gui.add_button("Back to the path", order=-1, visible=False)
+        back.on_click(self._go_to_nearest)
+
+        def offer(outputs: dict[str, Tensor]) -> None:
+            is_whole = model.show.value == "all" and not viewer.control_panel.crop_viewport
+            little = is_whole and float((outputs["accumulation"] > 0.5).float().mean()) < LITTLE
+            line.visible = back.visible = little
 
         def follow(camera: CameraHandle) -> None:
             nonlocal aspect, walked
-            if camera.aspect != aspect:  # a page tells its size only when it is laid out
+            if 0 < camera.aspect != aspect:  # a page tells its size only when it is laid out
                 aspect = camera.aspect
                 camera.fov = fitting_fov(self._half_width, self._half_height, aspect)
             ahead = (camera.look_at - camera.position) / VISER_NERFSTUDIO_SCALE_RATIO
@@ -156,6 +151,10 @@ class PathControls(ViewerElement[float], ViewerControl):
                 position = camera.position / VISER_NERFSTUDIO_SCALE_RATIO + PACE * self._near * nearer * direction
                 self._show(camera, View(position, direction, camera.up_direction))
 
+        threads, number = viewer.render_statemachines, client.client_id
+        threads[number].running, threads[number].interrupt_render_flag = False, True  # it renders nothing any more
+        threads[number] = FrameThread(viewer, client, getattr(viewer.trainer, "turns", None), offer)
+        threads[number].start()
         follow(client.camera)
         client.camera.on_update(follow)
         self._show(client.camera, self._path.at(self._path.start))
