@@ -28,7 +28,7 @@ Parser = Literal["auto", "nerfstudio", "colmap"]
 
 @dataclass
 class PlanCommand:
-    """Places MPIs in a scene without training: a table, plan.json, and pictures.
+    """Places MPIs in a scene without training: a table, plan.json, and a picture.
 
     plan.json can be edited and used with ``ns-train mmpi --pipeline.model.plan-file plan.json``.
     """
@@ -36,7 +36,7 @@ class PlanCommand:
     scene: tyro.conf.Positional[Path]
     """Folder with transforms.json, or with images and a COLMAP model."""
     output: Path
-    """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window)."""
+    """Folder for plan.json, plan.md and plan.png."""
     downscale_factor: int | None = None
     """Size of the images, as for the data parser."""
     parser: Parser = "auto"
@@ -79,28 +79,24 @@ class PlanCommand:
         plan.write_text(windows.to_json(), encoding="utf-8")
         table.write_text(f"{title}\n\n{_mark(plan)}\n\n{text}\n", encoding="utf-8")
         print(text)
-        print(f"\nWrote plan.json, plan.md and pictures in {self.output}.")
+        print(f"\nWrote plan.json, plan.md and plan.png in {self.output}.")
         print(f"Train with it: ns-train mmpi --pipeline.model.plan-file {quoted(plan)} --data ...")
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
-        """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""
+        """Draws the plan and returns the tables: for each window, over the observations of its own cameras."""
         from mmpi_ns.placement.observations import find_visible_points
-        from mmpi_ns.placement.show import draw_errors, draw_plan, draw_windows, explain, table
+        from mmpi_ns.placement.show import draw_plan, explain, table
         from mmpi_ns.placement.split import cameras_of, of_cameras
 
+        draw_plan(self.output / "plan.png", windows, observations)
         parts = []
         for i, window in enumerate(windows.windows):
             part = of_cameras(observations, cameras_of(window, observations.centers))
-            visible = find_visible_points(part)
-            report = explain(window.plan, part, visible)
-            suffix = f"-{i}" if len(windows) > 1 else ""
-            draw_plan(self.output / f"plan{suffix}.png", window.plan, part, visible)
-            draw_errors(self.output / f"errors{suffix}.png", window.plan, report)
+            report = explain(window.plan, part, find_visible_points(part))
             title = f"## Window {i}: {len(part.centers)} training cameras\n\n" if len(windows) > 1 else ""
             rule = window.plan.origin_of_plan
             parts.append(f"{title}{table(window.plan, part, report)}\n\n{rule[0].upper()}{rule[1:]}.")
         if len(windows) > 1:
-            draw_windows(self.output / "plan.png", windows, observations)
             total = sum(plan.texels for plan in windows.plans) / 1e6
             parts.append(f"{len(windows)} windows, {total:.2f} M texels in all.")
         return "\n\n".join(parts)
