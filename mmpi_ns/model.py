@@ -70,7 +70,7 @@ class MMPIModel(Model):
         if capture is not None:  # fewer texels than the rule's, where memory is short
             joint, placement = self._is_joint(windows), sized
             work = Work(
-                config.colour.feature_channels, not joint, capture.rays_per_step, config.sampling.threshold,
+                config.colour.feature_channels, not joint, capture.rays_per_step,
                 all_mpis=not joint and config.schedule.rays_per_mpi == "all", sample_bytes=sample_bytes(config.colour),
             )  # fmt: skip
             fixed = config.plan_file is not None or placement.arrangement != "automatic"

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 
 import torch
 
-from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.rendering.images import BYTES_PER_SLOT as BYTES_IN_ONE_PASS
-from mmpi_ns.rendering.images import CPU_RAYS
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, SIDE, head_shapes
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
@@ -20,20 +17,11 @@ from mmpi_ns.utils.machine import free_memory
 GIB = 2**30
 LEAST_SHARE = 0.02
 """Fraction of a plan's texels assumed to be in reach of training rays; computing it takes time."""
-RAYS_PER_PIXEL_RAY = 2
-"""Maximum rays of a step per pixel ray, with new views and keypoints."""
-TYPICAL_WIDTH, TYPICAL_KEPT = 256, 64
-"""Maximum samples that a ray keeps once surfaces have formed, and maximum mean over rays."""
-BYTES_PER_SLOT = 32
-"""Bytes of a step per sample that a ray may keep, before the samples are packed."""
-BYTES_PER_PACKED = 112
-"""Bytes of a step per ray and slot of the widest ray: packed samples, weights, losses, and their gradients."""
-BYTES_PER_TAP = 24
-"""Bytes of a step per texel that a kept sample reads: row, index among the distinct rows, weights and gradients."""
-COPIES = 4
-"""Arrays of the distinct rows that a step reads: values, gradients, total variation, optimiser."""
-ALLOCATOR_SHARE, ALLOCATOR_BYTES = 0.1, 2**28
-"""Bytes that torch's allocator cannot reuse, and bytes of libraries and compiled kernels on a GPU."""
+RAYS_PER_PIXEL_RAY, BYTES_PER_RAY = 2, 100_000
+"""Maximum rays of a step per pixel ray, with new views and keypoints; bytes of a GPU for a ray that keeps as many
+samples as a step can, with their texels and gradients."""
+PROGRAM_BYTES = 2**29
+"""Bytes of libraries and compiled kernels on a GPU, and of an image in the viewer."""
 SMALLEST_PLAN = 1e5
 """Texels below which a window is not worth training."""
 ATTEMPTS = 4
@@ -50,8 +38,6 @@ class Work:
     """Whether reliability is trained, so that it has moments."""
     pixel_rays: int = 0
     """Rays of a step."""
-    threshold: float = 3e-3
-    """Minimum weight of a kept sample once surfaces have formed."""
     all_mpis: bool = False
     """Whether each MPI renders all rays for a while."""
     sample_bytes: int = 0
@@ -80,24 +66,19 @@ def fit_memory(
     Raises:
         InputError: not enough memory is free.
     """
-    attempts = 1
-    while True:
+    for left in reversed(range(ATTEMPTS)):
         for window in windows.windows:
-            plan, seen = window.plan, views_of(window)
-            free, whole = free_memory(device) - reserved_bytes(plan, work, device), training_bytes(plan, None, work)
-            # For the reachable tiles: masks, and the 4 side planes of every image at the tiles of one plane.
-            cameras = 0 if seen is None else len(seen.origins)
-            largest = max(-(-height // SIDE) * -(-width // SIDE) for _, height, width in head_shapes(plan))
-            looking = 8 * count_tiles(plan) + 4 * 8 * 3 * cameras * largest
-            needed = max(looking, int(LEAST_SHARE * whole))
-            if needed <= free < whole:
-                needed = training_bytes(plan, seen, work, device)
+            plan = window.plan
+            free, needed = free_memory(device) - step_bytes(plan, work, device), training_bytes(plan, None, work)
+            if needed > free:  # texels that no ray reaches are not stored
+                least = int(LEAST_SHARE * needed)
+                needed = least if least > free else training_bytes(plan, views_of(window), work, device)
             if needed > free:
                 break
         else:
             return windows
         most = 0.95 * plan.texels * max(0.0, free) / needed
-        if again is None or most < SMALLEST_PLAN or attempts == ATTEMPTS:
+        if again is None or most < SMALLEST_PLAN or not left:
             raise InputError(
                 f"The tables of this plan ({plan.texels / 1e6:.0f} M texels) take at least {needed / GIB:.1f} GiB in "
                 f"training and {max(0.0, free) / GIB:.1f} GiB are free: give fewer texels, in the plan or with "
@@ -107,32 +88,18 @@ def fit_memory(
             f"{needed / GIB:.1f} GiB would be needed in training and {free / GIB:.1f} are free: texels are made "
             f"larger, {most / 1e6:.3g} M of them a window instead of {plan.texels / 1e6:.3g} M."
         )
-        windows, attempts = again(most), attempts + 1
+        windows = again(most)
+    return windows
 
 
-def reserved_bytes(plan: ScenePlan, work: Work, device: str | torch.device) -> int:
-    """Bytes of a GPU to reserve beside the tables: for a step at full resolution, once surfaces have formed, for an
-    image in the viewer, and for torch's allocator.
-
-    0 on a CPU, whose memory can be swapped.
-    """
+def step_bytes(plan: ScenePlan, work: Work, device: str | torch.device) -> int:
+    """Bytes of a GPU for a step, beside the tables; 0 on a CPU, whose memory can be swapped."""
     if torch.device(device).type != "cuda":
         return 0
-    rays = RAYS_PER_PIXEL_RAY * work.pixel_rays * (len(plan.mpis) if work.all_mpis else 1)
-    room = MarchOptions(work.threshold).most_kept(plan.samples_per_ray)
-    width, kept, taps = min(room, TYPICAL_WIDTH), min(room, TYPICAL_KEPT), 8 if plan.cube else 4
-    row = 4 * COPIES * (1 + work.feature_channels + work.two_phase)
-    each = BYTES_PER_SLOT * room + BYTES_PER_PACKED * width
-    step = rays * (each + kept * taps * BYTES_PER_TAP) + min(rays * kept * taps, plan.texels) * row
+    rays = work.pixel_rays * (len(plan.mpis) if work.all_mpis else 1)
     # Until surfaces have formed a ray keeps all samples, those of one MPI where each trains alone.
     samples = max((m.planes for m in plan.mpis), default=0) if work.two_phase else plan.samples_per_ray
-    step += work.sample_bytes * samples * work.pixel_rays * (len(plan.mpis) if work.all_mpis else 1)
-    return int((1 + ALLOCATOR_SHARE) * (step + BYTES_IN_ONE_PASS * room * CPU_RAYS)) + ALLOCATOR_BYTES
-
-
-def count_tiles(plan: ScenePlan) -> int:
-    """Tiles of 8 x 8 texels of all planes, stored or not."""
-    return sum(depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in head_shapes(plan))
+    return rays * (RAYS_PER_PIXEL_RAY * BYTES_PER_RAY + work.sample_bytes * samples) + PROGRAM_BYTES
 
 
 def training_bytes(plan: ScenePlan, views: TrainingViews | None, work: Work, device: str | torch.device = "cpu") -> int:
@@ -144,7 +111,7 @@ def training_bytes(plan: ScenePlan, views: TrainingViews | None, work: Work, dev
         work: what is trained.
         device: where the reachable tiles are computed.
     """
-    tiles = count_tiles(plan)
+    tiles = sum(depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in head_shapes(plan))
     stored = tiles if views is None else int(reachable_tiles(views, plan, device).sum())
     return stored_bytes(stored, tiles, work)
 
@@ -163,29 +130,23 @@ def stored_bytes(bricks: int, tiles: int, work: Work) -> int:
     return (bricks + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 8) + 4 * tiles
 
 
-def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: Sequence[int]) -> str:
+def describe(windows: WindowedPlan, steps: int, held: Sequence[int]) -> str:
     """The plan and the memory it needs, as text.
 
     Args:
         windows: of the capture.
         steps: of each window.
-        tables: ``training_bytes`` of each window.
-        pixels: bytes of training pixels in memory while each window trains.
+        held: bytes of tables, moments and training pixels while each window trains.
     """
-    most = max(range(len(windows)), key=lambda w: tables[w] + pixels[w])
-    memory = (
-        f"Memory in training: at most {(tables[most] + pixels[most]) / GIB:.2f} GiB (tables and moments "
-        f"{tables[most] / GIB:.2f}, pixels {pixels[most] / GIB:.2f}), plus the program and the work of a step."
-    )
     texels, lines, indent = [plan.texels for plan in windows.plans], [], ""
     if len(windows) > 1:
+        indent = "  "
         lines.append(
             f"A long capture: {len(windows)} windows of {steps} steps each, one after the other; "
             f"{sum(texels) / 1e6:.1f} M texels on disk, at most {max(texels) / 1e6:.1f} M in training at a time."
         )
     for i, window in enumerate(windows.windows):
         if len(windows) > 1:
-            indent = "  "
             lines.append(f"Window {i}, cameras within {window.radius:.3g} (and {window.margin:.3g} more to mix):")
         plan, count = window.plan, len(window.plan.mpis)
         mpis = f"{count} {'MPI' if count == 1 else 'MPIs'}"
@@ -197,4 +158,5 @@ def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: S
             )
         if plan.cube is not None:
             lines.append(f"{indent}  cube: {' x '.join(map(str, plan.cube.shape))} voxels")
-    return "\n".join([*lines, memory])
+    memory = f"{max(held) / GIB:.2f} GiB of tables, moments and pixels"
+    return "\n".join([*lines, f"Memory in training: at most {memory}, plus the program and the work of a step."])

@@ -116,10 +116,11 @@ class MMPITrainer(Trainer):
         """Prints capture, plan, memory and expected time together, before the first step."""
         run, manager, windows = self._run, self._manager, plan.windows
         work = Work(run.field.feature_channels, not run.progress.schedule.is_joint)
-        tables = [training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows]
         cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
+        tables = (training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows)
+        held = [each + manager.pixel_bytes(c) for each, c in zip(tables, cameras, strict=True)]
         log(manager.describe())
-        log(describe(plan, self._window_steps, tables, [manager.pixel_bytes(c) for c in cameras]))
+        log(describe(plan, self._window_steps, held))
         if self._follows_capture:
             rays, times = self._manager.config.train_num_rays_per_batch, self.config.pipeline.model.rays_times  # type: ignore[attr-defined]
             log(

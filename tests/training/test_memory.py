@@ -16,7 +16,7 @@ from training_runs import datamanager, load, ready, trainer_config
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training import memory, report
-from mmpi_ns.training.memory import Work, describe, fit_memory, reserved_bytes, training_bytes
+from mmpi_ns.training.memory import Work, describe, fit_memory, step_bytes, training_bytes
 from mmpi_ns.training.run import views_of
 from mmpi_ns.utils.errors import InputError
 
@@ -76,8 +76,8 @@ def test_of_a_window_with_too_many_pixels_so_many_are_held_as_is_told(scene, tmp
 def test_the_largest_window_decides_what_memory_is_told():
     plan = ScenePlan((make_mpi(),), None, 0.05, 1.5)
     windows = WindowedPlan(tuple(Window((x, 0.0, 0.0), 1.0, 0.1, plan) for x in (0.0, 2.0)))
-    said = describe(windows, 40, [2 * 2**30, 3 * 2**30], [2**30, 2**29])
-    assert "2 windows of 40 steps" in said and "at most 3.50 GiB (tables and moments 3.00, pixels 0.50)" in said
+    said = describe(windows, 40, [3 * 2**30, 7 * 2**29])
+    assert "2 windows of 40 steps" in said and "at most 3.50 GiB of tables, moments and pixels" in said
 
 
 GPU = "cuda:1"
@@ -114,7 +114,7 @@ def test_texels_of_an_automatic_plan_follow_the_free_memory(free, capsys, gib, p
 
     windows = fit_memory(windows_of(large_plan(200e6)), lambda _: None, WORK, GPU, again)
     assert len(asked) == places and capsys.readouterr().out.count("texels are made larger") == places
-    held = training_bytes(windows.plans[0], None, WORK) + reserved_bytes(windows.plans[0], WORK, GPU)
+    held = training_bytes(windows.plans[0], None, WORK) + step_bytes(windows.plans[0], WORK, GPU)
     assert held <= gib * 2**30 and (not places or held > 0.85 * gib * 2**30)
 
 
