@@ -83,7 +83,7 @@ class Score(Bench):
     def score(self) -> tuple[Scores, dict[str, float]]:
         """Scores, prints and returns name and metrics of each image, and the means."""
         parser = NerfstudioDataParserConfig(data=self.data, downscale_factor=self.downscale_factor)
-        check_transforms(parser, self.data, ("test",), opens=True)
+        check_transforms(parser, self.data, opens=True)
         outputs = parser.setup().get_dataparser_outputs(split="test")
         if not outputs.image_filenames:
             raise ValueError(f"{self.data} has no test images: list them as test_filenames in its transforms.json.")

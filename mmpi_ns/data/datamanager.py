@@ -19,7 +19,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.data.checks import PARSER_OPTIONS, check_transforms, log_once
+from mmpi_ns.data.checks import check_transforms, log_once
 from mmpi_ns.data.copies import fit_cameras
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.priors import Gains, Priors, PriorsConfig
@@ -30,7 +30,6 @@ from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, log
 from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import Generators, generator
-from mmpi_ns.utils.values import check_options
 
 Batch = tuple[TrainingRays, dict[str, Any]]
 CAPTURE = "capture"
@@ -99,11 +98,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
         """Rays of the next step with their sources, step and number."""
         parser: Any = config.dataparser
-        check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
-            mode = kwargs.get("test_mode", "val")
-            splits = ("train", "val", "test") if mode == "val" else ("train", "test")  # for the evaluation after it too
-            check_transforms(parser, Path(config.data or parser.data), splits, opens=mode != "inference")
+            opens = kwargs.get("test_mode", "val") != "inference"
+            check_transforms(parser, Path(config.data or parser.data), opens=opens)
         if isinstance(parser, NerfstudioDataParserConfig | ColmapDataParserConfig):
             # Points are read with the other priors, in float64. nerfstudio needs open3d for them, and asks on the
             # terminal where a capture names none.

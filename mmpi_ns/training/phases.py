@@ -168,15 +168,11 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, ha
 def check_schedule(config: ScheduleConfig) -> None:
     """Raises InputError naming the options that leave no schedule."""
     option = "--pipeline.model.schedule."
-    if config.training == "two-phase" and min(config.blend_share, config.finetune_share) < 0:
-        raise InputError(f"{option}blend-share and finetune-share must not be negative.")
     if config.training == "two-phase" and config.blend_share + config.finetune_share >= 1:
         raise InputError(
             f"{option}blend-share and finetune-share leave no steps for the first phase: give less than 1."
         )
     if any(a > b for a, b in pairwise(config.growth_shares)):
         raise InputError(f"{option}growth-shares must not decrease.")
-    if not 0 <= config.decay_from < 1:
-        raise InputError(
-            f"{option}decay-from must be a finite number from 0 to 1, 1 excluded, not {config.decay_from}."
-        )
+    if config.decay_from == 1:
+        raise InputError(f"{option}decay-from must be less than 1.")

@@ -80,7 +80,6 @@ def test_schedule_survives_json(training):
     [
         ({"steps": 0}, "max-num-iterations"),
         ({"steps": 100, "blend_share": 0.7, "finetune_share": 0.3}, "blend-share"),
-        ({"steps": 100, "blend_share": -0.25}, "blend-share"),
         ({"steps": 100, "growth_shares": (0.5, 0.25)}, "growth-shares"),
         ({"steps": 100, "decay_from": 1.0}, "decay-from"),
     ],

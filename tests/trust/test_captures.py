@@ -66,8 +66,6 @@ REFUSED = {
     "no pose": (frame(transform_matrix=...), [NAME, "has no transform_matrix", "remove the frame"]),
     "no file": (frame(file_path=...), ["number 4", "has no file_path"]),
     "file is empty": (frame(file_path=" "), ["file_path", "number 4"]),
-    "file is named in Latin-1": (frame(file_path="b\udcfcro.png"), ["file_path", "number 4", "udcfc", "UTF-8"]),
-    "one depth alone": (frame(depth_file_path="a.png"), ["has no depth_file_path and others have one"]),
     # Poses
     "pose with NaN": (pose(lambda m: m * [1, NAN, 1, 1]), [NAME, "4 x 4 matrix of finite numbers"]),
     "pose 2 x 2": (frame(transform_matrix=[[1, 2], [3, 4]]), [NAME, "4 x 4"]),
@@ -91,16 +89,6 @@ REFUSED = {
     "fisheye of instant-ngp": (file(is_fisheye=True), ["instant-ngp-data", "OPENCV_FISHEYE"]),
     "k1 is NaN": (file(k1=NAN), ["distortion k1", "nan"]),
     "k1 is huge": (file(k1=1e6), ["distortion", "cannot be undone"]),
-    "distortion_params of three": (file(distortion_params=[0, 0, 0]), ["distortion_params", "6 numbers"]),
-    # Fields of the whole file
-    "applied_transform is text": (file(applied_transform="none"), ["applied_transform", "3 rows of 4"]),
-    "fisheye radius is text": (file(fisheye_crop_radius="a"), ["fisheye_crop_radius", "'a'"]),
-    "applied_scale is 0": (file(applied_scale=0), ["applied_scale", "above 0"]),
-    "orientation is unknown": (file(orientation_override="left"), ["orientation_override", "'left'"]),
-    # Splits
-    "a point cloud that is a number": (file(ply_file_path=3), ["ply_file_path", "3"]),
-    "train list with a stranger": (lambda m: m["train_filenames"].append("images/no.png"), ["no.png", "no frame"]),
-    "val list is missing": (file(val_filenames=...), ["no list val_filenames"]),
 }
 
 

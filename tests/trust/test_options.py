@@ -1,4 +1,4 @@
-"""Options that cannot be used, or would be ignored, are named before anything is written."""
+"""Options that cannot be used are named before anything is written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ P, M, D = "pipeline__model__placement__", "pipeline__model__", "pipeline__datama
 
 REFUSED = {
     "max_num_iterations": -1,
-    "logging__steps_per_log": 0,
     "machine__seed": 10**30,
     "machine__num_devices": 2,
     "machine__device_type": "mps",
@@ -30,13 +29,6 @@ REFUSED = {
     M + "sampling__cube_alpha": 2.0,
     M + "schedule__growth_shares": (0.5, 2.0),
     M + "loss__distortion": NAN,
-    D + "dataparser__scale_factor": 0.0,
-    D + "dataparser__eval_interval": -8,
-}
-IGNORED = {
-    D + "patch_size": 4,
-    D + "images_on_gpu": True,
-    M + "enable_collider": True,
 }
 
 
@@ -47,8 +39,7 @@ def option_of(name):
 @pytest.mark.parametrize("name", REFUSED)
 def test_an_option_out_of_range_is_named(whole_scene, tmp_path, name):
     said = train(whole_scene, tmp_path / "out", **{name: REFUSED[name]}).sentence
-    assert option_of(name.split("dataparser__")[-1]) in said
-    assert "dataparser" in name or not (tmp_path / "out").exists()
+    assert option_of(name) in said and not (tmp_path / "out").exists()
 
 
 def test_a_method_of_the_paper_needs_a_number_of_steps():
@@ -59,16 +50,9 @@ def test_a_method_of_the_paper_needs_a_number_of_steps():
         check_run(config)
 
 
-@pytest.mark.parametrize("name", IGNORED)
-def test_an_option_that_would_be_ignored_is_refused(whole_scene, tmp_path, name):
-    said = train(whole_scene, tmp_path / "out", **{name: IGNORED[name]}).sentence
-    assert option_of(name) in said and "no effect" in said
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"experiment_name": "a" * 400}, ["--experiment-name", "too long"]),
         ({"load_step": 3}, ["--load-step", "--load-dir"]),
         ({"mixed_precision": True}, ["--mixed-precision", "CPU"]),
     ],
