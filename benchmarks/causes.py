@@ -14,11 +14,11 @@ import torch
 from nerfstudio.model_components.lib_bilagrid import color_correct
 from numpy.typing import NDArray
 from plane_crossings import images_of
+from refined import refined_camera
 from report import Bench, Report, Row, page, table
 from torch import Tensor
 
 from mmpi_ns.data.posed_images import posed_images
-from mmpi_ns.rendering.pipeline import refined_camera
 from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.errors import InputError
 from mmpi_priors.views import look_up, project

@@ -12,11 +12,15 @@ import torch
 from lab import SceneBench, train_and_evaluate
 from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
 from numpy.typing import NDArray
+from plane_crossings import images_of
+from refined import refined_camera
 from report import Report, Row, page, table
 from trainers import Scene
 
+from mmpi_ns.rendering.metrics import psnr_and_ssim
 from mmpi_ns.scripts.command import run
 from mmpi_prepare.adjustment import degrees_between
+from mmpi_show.bake import load_model
 
 Array = NDArray[np.float64]
 MODES = {"as they are": "off", "refined in training": "SO3xR3"}
@@ -56,12 +60,22 @@ class Poses(SceneBench):
         off = (self.degrees, self.distance) if given == "disturbed" else (0.0, 0.0)
         write_scene(self.data.resolve(), exact, self.test_images)
         write_scene(self.data.resolve(), scene, self.test_images, *off)
-        options = ["--pipeline.model.camera-optimizer.mode", mode, "--pipeline.refine-eval-poses", "True"]
+        options = ["--pipeline.model.camera-optimizer.mode", mode]
         options += ["--max-num-iterations", str(self.steps), "--pipeline.model.lpips-net", "none"]
         copied = Scene(scene, self.downscale_factor)
         run, results, made = train_and_evaluate(copied, folder, "mmpi-small", options, (), self.cores)
-        names = ("psnr", "ssim", "refined_psnr", "refined_ssim", "refined_rotation_degrees")
-        return {name: results[name] for name in names} | made | pose_errors(exact, scene, run)
+        scores = {name: results[name] for name in ("psnr", "ssim")} | refined_scores(run)
+        return scores | made | pose_errors(exact, scene, run)
+
+
+def refined_scores(run: Path) -> Row:
+    """Means over the test images of a run, each at the pose from which its frozen model renders it best."""
+    pipeline, rows = load_model(run / "config.yml"), []
+    for i, (camera, image) in enumerate(images_of(pipeline)):
+        moved_camera, degrees, _ = refined_camera(pipeline.model, camera, image, i)
+        outputs = pipeline.as_exposed(moved_camera, pipeline.model.get_outputs_for_camera(moved_camera), image)
+        rows.append(psnr_and_ssim(outputs["rgb"], image) | {"rotation_degrees": degrees})
+    return {f"refined_{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
 def write_scene(data: Path, folder: Path, test_images: int, degrees: float = 0.0, distance: float = 0.0) -> Path:
@@ -135,7 +149,7 @@ def markdown(content: Row) -> str:
     said = (
         "Errors of training poses are means, against the scene's own poses. PSNR and SSIM are `ns-eval`'s means over "
         "the test images, at the scene's own poses. For the last three columns each test image's pose was moved to "
-        "where the frozen model shows it best (`--pipeline.refine-eval-poses True`): what the model knows of the scene "
+        "where the frozen model shows it best: what the model knows of the scene "
         "whatever frame its poses drifted to, and no score of new views at given poses."
     )
     return page("Refined poses", content["made"], said, table(columns, rows))

@@ -214,9 +214,6 @@ class MMPIPipelineConfig(VanillaPipelineConfig):
     """Settings of the pipeline."""
 
     _target: Callable[..., Any] = Later("mmpi_ns.rendering.pipeline", "MMPIPipeline")
-    refine_eval_poses: bool = False
-    """Score each evaluated image a second time, with its pose refined against the trained model: metrics "refined_...",
-    in addition to the plain ones (docs/captures.md, "Poses that are not exact")."""
 
 
 @dataclass

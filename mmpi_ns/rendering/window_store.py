@@ -13,9 +13,8 @@ from weakref import WeakValueDictionary
 import torch
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.files import to_text, write_atomically
+from mmpi_ns.utils.files import write_atomically
 
 _DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
 """Exceptions of reading a damaged file."""
@@ -97,36 +96,17 @@ class WindowStore:
         self._held[window] = self._referenced[window] = field
         return field
 
-    def adopt(self, other: Path, plans: dict[int, ScenePlan]) -> None:
-        """Takes over finished windows of the run that this one resumes.
-
-        Args:
-            other: that run's folder of windows.
-            plans: of the windows to take over, by number.
-
-        Raises:
-            InputError: one is missing or damaged, or was trained with another plan.
-        """
-        if not plans or other.resolve() == self.path(0).parent.resolve():
+    def adopt(self, other: Path, count: int) -> None:
+        """Copies the first ``count`` windows of the run that this one resumes, from its folder of windows. Raises
+        InputError if one is missing."""
+        if not count or other.resolve() == self.path(0).parent.resolve():
             return
-        for window, plan in plans.items():
+        for window in range(count):
             path, source = self.path(window), other / self.path(window).name
             if not source.is_file():
                 raise InputError(
                     f"Window {window} of the run to go on from is missing: {source} is not there. Put it back, or "
                     "resume from a checkpoint of before its end with --load-step."
-                )
-            try:
-                state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
-                stored = ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
-            except _DAMAGED as error:
-                raise InputError(
-                    f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
-                ) from error
-            if stored != plan:
-                raise InputError(
-                    f"{source} was trained with another scene plan: resume with the settings in its run's "
-                    "config.yml, or give that run's plan.json with --pipeline.model.plan-file."
                 )
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, lambda unfinished, source=source: shutil.copyfile(source, unfinished))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -52,7 +51,7 @@ class PlanCommand:
         # Slow imports, which --help does not need.
         from mmpi_ns.placement.split import most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
-        from mmpi_ns.utils.files import make_writable
+        from mmpi_ns.utils.files import make_writable, write_plan, write_text
 
         check_options(self, {"size": Number(0, above=True)}, "--")
         check_placement(self.placement, "--placement.")
@@ -61,12 +60,6 @@ class PlanCommand:
         make_writable(self.output, "--output")
         # Before the images are read, so that an error in the plan is reported at once.
         windows = None if self.plan_file is None else WindowedPlan.load(self.plan_file)
-        plan, table = self.output / "plan.json", self.output / "plan.md"
-        if plan.is_file() and not (table.is_file() and _mark(plan) in table.read_text("utf-8", errors="replace")):
-            raise InputError(
-                f"{plan} was edited since mmpi-plan wrote it, or is not from there: "
-                "give another --output, or remove it."
-            )
         observations, manager = load_observations(self.scene, self.downscale_factor, self.parser)
         if windows is None:
             steps = steps_for(most_pixels(observations, self.placement), self.size)
@@ -76,8 +69,9 @@ class PlanCommand:
         if manager.priors is not None and manager.priors.movers:
             text += f"\n\n{manager.priors.movers}."
         title = f"# Plan of {self.scene.resolve().name}"
-        plan.write_text(windows.to_json(), encoding="utf-8")
-        table.write_text(f"{title}\n\n{_mark(plan)}\n\n{text}\n", encoding="utf-8")
+        plan = self.output / "plan.json"
+        write_plan(plan, windows.to_json())
+        write_text(self.output / "plan.md", f"{title}\n\n{text}\n")
         print(text)
         print(f"\nWrote plan.json, plan.md and plan.png in {self.output}.")
         print(f"Train with it: ns-train mmpi --pipeline.model.plan-file {quoted(plan)} --data ...")
@@ -100,11 +94,6 @@ class PlanCommand:
             total = sum(plan.texels for plan in windows.plans) / 1e6
             parts.append(f"{len(windows)} windows, {total:.2f} M texels in all.")
         return "\n\n".join(parts)
-
-
-def _mark(plan: Path) -> str:
-    """Comment with a plan's hash, which reveals later edits of the plan; plan.md does not show it."""
-    return f"<!-- plan.json: {hashlib.sha256(plan.read_bytes()).hexdigest()} -->"
 
 
 def load_observations(

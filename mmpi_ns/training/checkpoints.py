@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 import re
 from collections.abc import Mapping
@@ -23,7 +22,7 @@ from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import InputError, brief, quoted
-from mmpi_ns.utils.files import to_text, write_atomically, write_errors
+from mmpi_ns.utils.files import to_text, write_errors
 from mmpi_ns.utils.pages import all_zero
 from mmpi_ns.utils.values import as_text
 
@@ -31,20 +30,6 @@ HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "rays
 """Keys of every checkpoint of this method."""
 PLAN_FILE, WINDOWS_FOLDER = "plan.json", "windows"
 _held: dict[Path, FileLock] = {}
-
-
-def write_plan(path: Path, plan: WindowedPlan) -> None:
-    """Writes a run's plan for the user to read. Raises InputError if the user has edited the present file."""
-    text, digest_file = plan.to_json(), path.with_name(f".{path.name}.sha256")
-    present = path.read_bytes() if path.is_file() else text.encode()
-    digest = digest_file.read_text(encoding="ascii") if digest_file.is_file() else ""
-    if present != text.encode() and hashlib.sha256(present).hexdigest() != digest:
-        raise InputError(
-            f"{path} is not the plan of this run and was edited, it seems: give it with --pipeline.model.plan-file in "
-            "another --timestamp, or remove it."
-        )
-    write_atomically(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
-    digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
 
 
 def checkpoints_in(folder: Path) -> dict[int, Path]:

@@ -37,7 +37,6 @@ from mmpi_ns.training.checkpoints import (
     checkpoints_in,
     read_checkpoint,
     states_of,
-    write_plan,
 )
 from mmpi_ns.training.frames import FrameTurns
 from mmpi_ns.training.memory import Work, describe, training_bytes
@@ -45,10 +44,10 @@ from mmpi_ns.training.report import TrainingLog, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.step_graph import StepGraphs
 from mmpi_ns.utils.errors import InputError, duration, log, quoted
-from mmpi_ns.utils.files import write_atomically
+from mmpi_ns.utils.files import write_atomically, write_plan
 from mmpi_ns.utils.host import discard, keep_freed_memory, signals_go_to
-from mmpi_ns.utils.machine import free_cores, unused_gpu
-from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
+from mmpi_ns.utils.machine import unused_gpu
+from mmpi_ns.utils.parallel import one_thread_each, torch_apart
 from mmpi_ns.utils.random_draws import generator
 
 
@@ -88,7 +87,7 @@ class MMPITrainer(Trainer):
             config.max_num_iterations = self._window_steps
             plan = self._run.progress.windows
             self.base_dir.mkdir(parents=True, exist_ok=True)
-            write_plan(self.base_dir / PLAN_FILE, plan)
+            write_plan(self.base_dir / PLAN_FILE, plan.to_json())
             if len(self._run.field.density) <= BRICK:  # the empty brick alone
                 raise InputError(
                     "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face "
@@ -128,14 +127,8 @@ class MMPITrainer(Trainer):
                 "--max-num-iterations gives others."
                 + (f" {rays:,} rays a step, {times} times the method's, suit this GPU." if times > 1 else "")
             )
-        if not str(self.device).startswith("cuda"):
-            if num_threads() > 1 and (cores := free_cores()) < num_threads() - 0.5:
-                log(
-                    f"{num_threads()} threads run and {cores:.1f} cores are free, so they wait for each other: end "
-                    f"other programs, or start with OMP_NUM_THREADS={max(1, round(cores))}."
-                )
-            if gpu := unused_gpu():
-                log(f"No GPU is used: {gpu}.")
+        if not str(self.device).startswith("cuda") and (gpu := unused_gpu()):
+            log(f"No GPU is used: {gpu}.")
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with rates of the schedule where no other scheduler is configured."""
@@ -331,7 +324,7 @@ class MMPITrainer(Trainer):
         self.config.load_dir, self.config.load_checkpoint = asked, asked_for
         if path is not None:
             progress = run.progress
-            finished = dict(enumerate(progress.windows.plans[: progress.schedule.window_at(self._start_step)]))
+            finished = progress.schedule.window_at(self._start_step)
             run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished)
 
 

@@ -77,6 +77,13 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def write_plan(path: Path, text: str) -> None:
+    """Writes a plan.json. Another one that is there, which its user may have edited, is kept as plan.json.before."""
+    if path.is_file() and path.read_bytes() != text.encode():
+        os.replace(path, path.with_name(path.name + ".before"))
+    write_text(path, text)
+
+
 @contextmanager
 def write_errors(folder: Path, option: str) -> Iterator[None]:
     """Errors of writing in a folder, within the block: WriteError with the option that names another folder."""
