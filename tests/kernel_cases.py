@@ -12,7 +12,6 @@ from torch import Tensor
 
 from mmpi_ns.ops import depth_sums as depth_sums
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops import use as use
 from mmpi_ns.ops import variation as variation
 from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gather import Taps
@@ -173,35 +172,12 @@ def _updates(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
-def _texels(device: str, shapes: Shapes) -> list[tuple]:
-    cases = []
-    for mpis in shapes.mpis:
-        layout = _scene(device, shapes.cube, mpis)[0]
-        heads, planes = ((_random(device, ROWS, n)[:, 0] * n).long() for n in (mpis, 6))
-        cases.append((layout, heads, planes, 2 * _random(device, ROWS, 3) - 1))
-    return cases
-
-
-def _uses(device: str, shapes: Shapes) -> list[tuple]:
-    cases = []
-    for gains in (True, False):
-        taps = [Taps((_random(device, RAYS, n) * ROWS).int(), _random(device, RAYS, n)) for n in (4, 8)]
-        slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(2)])
-        peak, gain = 0.1 * _random(device, 9), _random(device, 9) if gains else None
-        rows = 2 * torch.arange(ROWS, device=device)[: 9 * BRICK // 2]
-        taps = [Taps(each.positions.clamp(max=len(rows) - 1), each.weights) for each in taps]
-        cases.append((rows, taps, slots, _random(device, RAYS, 4), _random(device, RAYS), peak, gain))
-    return cases
-
-
-CHANGED = {"adam_rows": (0, 1), "note_use": (5,)}
+CHANGED = {"adam_rows": (0, 1)}
 """Arguments that an operation changes."""
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "composite_weights": _composites,
     "depth_sums": _depths,
     "adam_rows": _updates,
-    "texel_rows": _texels,
-    "note_use": _uses,
     "march": _marches,
     "total_variation": _variations,
     "gather_taps": _gathers,

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import Table, weigh_rows
-from mmpi_ns.ops.use import note_use
 from mmpi_ns.scene.bricks import grown_tiles, move_bricks, new_table, resample, tiles_with_copies
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
@@ -305,6 +304,38 @@ class TexelTables(Field):
         self.build(plan, float(state_dict[prefix + "texel_factor"]), state_dict[prefix + "tiles"], copied)
         self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as written, even if plans have other fields now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def note_use(
+    rows: Int[Tensor, "U"],
+    taps: list[Taps],
+    slots: Int[Tensor, "N"],
+    weights: Float[Tensor, "R S"],
+    errors: Float[Tensor, "R"],
+    peak: Float[Tensor, "B"],
+    gain: Float[Tensor, "B"] | None,
+) -> None:
+    """Raises the peaks of bricks to the largest weight of a sample that reads them, and adds weights times errors to
+    the gains of the bricks of first texels, in the order of samples.
+
+    Args:
+        rows: of the tables, each once and rising.
+        taps: of the samples, those on planes first; positions are among ``rows``.
+        slots: flat slot of each sample in ``weights``.
+        weights: of the samples.
+        errors: of the rays.
+        peak: of the bricks, changed in place.
+        gain: likewise; None: is not recorded.
+    """
+    of_samples, bricks = weights.reshape(-1).index_select(0, slots), rows >> 6
+    sizes = [len(each.positions) for each in taps]
+    for each, weight in zip(taps, of_samples.split(sizes), strict=True):
+        read = bricks.index_select(0, each.positions.reshape(-1))
+        peak.scatter_reduce_(0, read, weight.repeat_interleave(each.positions.shape[1]), "amax")
+    if gain is not None:
+        shares = of_samples * errors.index_select(0, slots // weights.shape[1])
+        for each, share in zip(taps, shares.split(sizes), strict=True):
+            gain.index_add_(0, bricks.index_select(0, each.positions[:, 0]), share)
 
 
 def replace_data(parameter: nn.Parameter, data: Tensor) -> None:

@@ -127,7 +127,7 @@ def order_by_head(
     return slots, heads[slots], planes, ndc, counts
 
 
-@operation("gpu")
+@operation()
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:

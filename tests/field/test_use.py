@@ -1,4 +1,4 @@
-"""What bricks are used for: compiled and plain against loops in float64 (ops/use)."""
+"""What bricks are used for, against loops in float64."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 
 import pytest
 import torch
-from compiled import compiled, normal  # noqa: F401
+from compiled import normal
 
+from mmpi_ns.field.tables import note_use
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import index_rows
-from mmpi_ns.ops.use import note_use
 from mmpi_ns.scene.texels import BRICK
 
 BRICKS, RAYS, SLOTS = 40, 90, 11
@@ -65,46 +65,30 @@ CASES = {
 }
 
 
-def noted(function, arguments, threads=1):
+def noted(arguments):
     """Peaks and gains afterwards."""
-    before, records = torch.get_num_threads(), [x.clone() for x in arguments[5:]]
-    try:
-        torch.set_num_threads(threads)
-        function(*arguments[:5], *records)
-    finally:
-        torch.set_num_threads(before)
+    records = [x.clone() for x in arguments[5:]]
+    note_use(*arguments[:5], *records)
     return records
 
 
-@pytest.mark.parametrize("function", [note_use, note_use.reference])
 @pytest.mark.parametrize("case", CASES)
-def test_peaks_and_gains_are_those_of_loops(function, case):
+def test_peaks_and_gains_are_those_of_loops(case):
     arguments = use(*CASES[case])
-    (peak, gain), (peaks, gains) = noted(function, arguments), by_loops(*arguments)
+    (peak, gain), (peaks, gains) = noted(arguments), by_loops(*arguments)
     assert peak.tolist() == peaks and gain.tolist() == pytest.approx(gains, rel=1e-6)
     if len(arguments[2]) > 1:
         assert (peak > arguments[5]).any() and (gain > arguments[6]).any()
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("case", CASES)
-def test_bits_are_those_of_plain_torch_for_any_number_of_threads(monkeypatch, case, threads):
-    monkeypatch.setattr("mmpi_ns.ops.use.AT_LEAST", 50)
-    arguments = use(*CASES[case], seed=3)
-    for a, b in zip(noted(note_use, arguments, threads), noted(note_use.reference, arguments), strict=True):
-        assert torch.equal(a, b)
-
-
-@pytest.mark.parametrize("function", [note_use, note_use.reference])
-def test_samples_without_weight_change_nothing(function):
+def test_samples_without_weight_change_nothing():
     rows, taps, slots, weights, *rest = use(*CASES["planes and cube"])
     arguments = (rows, taps, slots, 0 * weights, *rest)
-    assert all(torch.equal(a, b) for a, b in zip(noted(function, arguments), rest[1:], strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(noted(arguments), rest[1:], strict=True))
 
 
-@pytest.mark.parametrize("function", [note_use, note_use.reference])
-def test_a_weight_that_is_not_a_number_is_seen_and_stays(function):
+def test_a_weight_that_is_not_a_number_is_seen_and_stays():
     rows, taps, slots, weights, *rest = use(CASES["one row"][0])
     weights.view(-1)[slots[5]] = math.nan
-    peak, gain = noted(function, (rows, taps, slots, weights, *rest))
+    peak, gain = noted((rows, taps, slots, weights, *rest))
     assert peak.isnan().nonzero().tolist() == gain.isnan().nonzero().tolist() == [[1234 // BRICK]]
