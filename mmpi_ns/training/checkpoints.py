@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import re
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import InputError, brief, quoted
 from mmpi_ns.utils.files import to_text, write_errors
 from mmpi_ns.utils.pages import all_zero
-from mmpi_ns.utils.values import as_text
 
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "rays", "capture"}
 """Keys of every checkpoint of this method."""
@@ -158,27 +156,11 @@ def check_same_run(
     stored = WindowedPlan.from_json(to_text(state["pipeline"]["_model.progress.windows_bytes"]))
     if stored != plan:
         raise InputError(
-            f"{path} was trained with another scene plan ({_difference(stored, plan)}): resume with the settings in "
-            f"its config.yml, or give its {PLAN_FILE} with --pipeline.model.plan-file."
+            f"{path} was trained with another scene plan: resume with the settings in its config.yml, or give its "
+            f"{PLAN_FILE} with --pipeline.model.plan-file."
         )
     if ("_model.camera_optimizer.pose_adjustment" in state["pipeline"]) == (pose_mode == "off"):
         there, as_there = ("unrefined", "off") if pose_mode != "off" else ("refined", "SO3xR3")
         raise InputError(
             f"{path} was trained with {there} poses: resume with --pipeline.model.camera-optimizer.mode {as_there}."
         )
-
-
-def _difference(theirs: WindowedPlan, ours: WindowedPlan) -> str:
-    """First difference between two plans."""
-    shapes = [(len(p), sum(len(plan.mpis) for plan in p.plans)) for p in (theirs, ours)]
-    if shapes[0] != shapes[1]:
-        there, here = (f"{mpis} MPIs" if w == 1 else f"{w} windows with {mpis} MPIs" for w, mpis in shapes)
-        return f"{there} there, {here} here"
-    for w, (a, b) in enumerate(zip(theirs.plans, ours.plans, strict=True)):
-        for x, y in [*zip(a.mpis, b.mpis, strict=False), (a, b)]:
-            for name in [f.name for f in fields(x) if f.name != "mpis"]:
-                there, here = getattr(x, name), getattr(y, name)
-                if there != here:
-                    where = (f" of MPI {x.name!r}" if x is not a else "") + (f" in window {w}" if len(ours) > 1 else "")
-                    return f"{name!r}{where}: {as_text(there)} there, {as_text(here)} here"
-    return "other borders of windows"

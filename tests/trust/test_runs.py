@@ -140,14 +140,14 @@ def test_a_new_run_into_the_folder_of_an_old_one_is_refused(whole_scene, finishe
 # Resuming ------------------------------------------------------------------------------------------------------------
 
 
-def test_another_plan_is_refused_and_what_differs_is_named(whole_scene, trained, tmp_path):
+def test_another_plan_is_refused(whole_scene, trained, tmp_path):
     plan = json.loads((trained / "plan.json").read_text())
     plan["mpis"][0]["planes"] += 3
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     said = train(
         whole_scene, tmp_path, load_dir=trained / "nerfstudio_models", pipeline__model__plan_file=tmp_path / "plan.json"
     ).sentence
-    assert "another scene plan" in said and "'planes'" in said and plan["mpis"][0]["name"] in said
+    assert "another scene plan" in said and "plan.json" in said
 
 
 DAMAGED = {
