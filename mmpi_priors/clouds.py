@@ -66,12 +66,11 @@ def read_ply(path: Path) -> Array | None:
     try:
         points = PlyData.read(path)["vertex"]
         xyz = np.stack([np.asarray(points[name], dtype=np.float64) for name in "xyz"], -1)
+        if not len(xyz):
+            raise ValueError("it holds none")
     except (PlyParseError, KeyError, ValueError, TypeError, OSError, MemoryError) as error:
         says = f"{path} is not a PLY file of points ({error}): write it again."
         log_once(f"[bold yellow]{says} Training goes on without the point cloud.")
-        return None
-    if not len(xyz):
-        log_once(f"[bold yellow]The point cloud {path} holds no point: training goes on without it.")
         return None
     return xyz
 

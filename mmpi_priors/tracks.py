@@ -98,8 +98,7 @@ def triangulate(images: PosedImages) -> SfmModel:
             sfm.find_features(database, work, names, options)
             for file, features in zip(images.files, sfm.count_features(database), strict=True):
                 if features is None:
-                    why = "by COLMAP"
-                    raise InputError(f"Image {file} cannot be read ({why}): repair it or leave it out.")
+                    raise InputError(f"Image {file} cannot be read (by COLMAP): repair it or leave it out.")
             if pairs:
                 sfm.match_pairs(database, pairs, guided=guided, least=least)
                 error = misfit(opencv, lens, Matches.of(model, database))

@@ -77,8 +77,7 @@ def load_view(images: PosedImages, i: int, side: int) -> View:
 def _read(file: Path, mode: int) -> NDArray[Any]:
     pixels = cv2.imread(str(file), mode | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
-        why = "by OpenCV"
-        raise InputError(f"Image {file} cannot be read ({why}): repair it or leave it out.")
+        raise InputError(f"Image {file} cannot be read (by OpenCV): repair it or leave it out.")
     return pixels
 
 

@@ -16,19 +16,9 @@ PAGE = Path(__file__).parent / "page"
 
 
 def write_page(folder: Path, single_file: Path | None = None) -> Path:
-    """Writes the page of a baked scene: ``index.html`` beside it, or one file that contains it and opens by a double
-    click.
+    """Writes the page of a baked scene into its folder, or one file that contains it and opens by a double click.
 
-    Args:
-        folder: of the baked scene.
-        single_file: the one file to write.
-
-    Returns:
-        The file that was written.
-
-    Raises:
-        ValueError: the scene is missing or of another version.
-        OSError: the disk is full or cannot be written.
+    Returns the file. Raises ValueError if the scene is missing or of another version, OSError if the disk is full.
     """
     header, path = read_header(folder), single_file or folder / "index.html"
     first, rest, last = [], [], []

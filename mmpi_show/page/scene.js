@@ -130,7 +130,7 @@ function atlas(channels, bricks, per, count) {
 
 // The network as GLSL, its numbers in a uniform block; weights of four inputs are one vec4.
 function networkSource(shader, channels) {
-  const inputs = channels + 3 * (1 + 2 * shader.direction_octaves);
+  const encoded = 3 * shader.direction_octaves, inputs = channels + 3 + 2 * encoded;
   const lines = [], quads = (n) => Math.ceil(n / 4);
   let block = 0, from = "x0";
   shader.layers.forEach(([outputs, given], layer) => {
@@ -145,26 +145,20 @@ function networkSource(shader, channels) {
     block += outputs * (width + 1);
     from = to;
   });
-  const mean = [];
-  for (let c = 0; c < channels; c++)
-    mean.push(`x0[${c}] = ${c < 3 ? "" : "2.0 * "}sums[${c >> 2}].${"xyzw"[c & 3]} / mass${c < 3 ? "" : " - 1.0"};`);
-  const encoded = [];
-  for (let a = 0; a < 3; a++) {
-    encoded.push(`x0[${channels + a}] = direction[${a}];`);
-    for (let i = 0; i < shader.direction_octaves; i++) {
-      const angle = `${(Math.PI * 2 ** i).toFixed(9)} * direction[${a}]`, at = channels + 3 + 3 * i + a;
-      encoded.push(`x0[${at}] = sin(${angle}); x0[${at + 3 * shader.direction_octaves}] = cos(${angle});`);
-    }
-  }
   return {
     size: block,
     source: `layout(std140) uniform Network { vec4 numbers[${block}]; };
 vec3 shade(vec4 sums[GROUPS], float mass, vec3 direction) {
   float x0[${4 * quads(inputs)}];
   for (int i = 0; i < ${4 * quads(inputs)}; i++) x0[i] = 0.0;
-  ${mean.join("\n  ")}
+  for (int c = 0; c < ${channels}; c++) x0[c] = (c < 3 ? 1.0 : 2.0) * sums[c >> 2][c & 3] / mass - (c < 3 ? 0.0 : 1.0);
   vec3 mean = vec3(x0[0], x0[1], x0[2]);
-  ${encoded.join("\n  ")}
+  for (int a = 0; a < 3; a++) x0[${channels} + a] = direction[a];
+  for (int i = 0; i < ${encoded}; i++) {
+    float angle = ${Math.PI.toFixed(9)} * float(1 << i / 3) * direction[i % 3];
+    x0[${channels + 3} + i] = sin(angle);
+    x0[${channels + 3 + encoded} + i] = cos(angle);
+  }
   ${lines.join("\n  ")}
   vec3 change = vec3(${from}[0], ${from}[1], ${from}[2]) / ${shader.bound.toFixed(6)};
   return mean / (mean + (1.0 - mean) * exp(-${shader.bound.toFixed(6)} * tanh(clamp(change, -9.0, 9.0))));

@@ -1,4 +1,4 @@
-// Rendering of rays from baked bricks (scene/baked.py): bytes, of which a sample reads one brick alone. The example in
+// Rendering of rays from baked bricks (scene.py): bytes, of which a sample reads one brick alone. The example in
 // NumPy is reader.py.
 #include "parts.h"
 #include "walk.h"

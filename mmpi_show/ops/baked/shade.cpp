@@ -1,4 +1,4 @@
-// The network that shades a ray once (rendering/baked.py, Shader), sixteen rays at a time.
+// The network that shades a ray once (scene.py, Shader), sixteen rays at a time.
 #include "lanes.h"
 #include "parts.h"
 
