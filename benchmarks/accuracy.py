@@ -59,12 +59,12 @@ def measure(solids: Solids, mpis: list[MPIPlan], blends: bool = False) -> dict[s
     origins, directions = cameras()
     field = bake(solids, mpis)
     with torch.no_grad():
-        found = render(field, bundle_of(origins, directions), THRESHOLD, blends)
+        results = render(field, bundle_of(origins, directions), THRESHOLD, blends)
     t = solids.hit(origins, directions)
     exact = solids.color(origins + t[:, None] * directions)
-    slots = (of_slots(found, name) for name in ("inverse_t", "valid"))
-    depth = np.abs(median_inverse_distance(found.composite.weights, *slots)[:, 0].double().numpy() - 1 / t)
-    color = np.abs(found.rgb.double().numpy() - exact).mean(-1)
+    slots = (of_slots(results, name) for name in ("inverse_t", "valid"))
+    depth = np.abs(median_inverse_distance(results.composite.weights, *slots)[:, 0].double().numpy() - 1 / t)
+    color = np.abs(results.rgb.double().numpy() - exact).mean(-1)
     return {"depth_error": float(depth.mean()), "color_error": float(color.mean())}
 
 
@@ -162,11 +162,10 @@ def headline(rows: dict[str, list[Row]]) -> dict[str, float]:
 
 def markdown(rows: dict[str, list[Row]], head: dict[str, float], made: Row) -> str:
     """The page."""
-    said = """\
-A slanted wall and a ball before it, both filled with a smooth texture, are written into the texels as they
-are: a texel is opaque where its point lies inside a solid, and has that point's colour. No training. Five
-cameras up to 0.53 units from the MPI, 432 rays each; errors are means over all rays. Depth is compared as
-1/t, in which planes are evenly spaced."""
+    intro = """\
+A slanted wall and a ball before it, with a smooth texture, are written into the texels without training: a texel
+is opaque where its point lies inside a solid, and has that point's colour. Means over 432 rays of each of five
+cameras, up to 0.53 units from the MPI. Depth is compared as 1/t."""
     orders = [
         {"error": "depth", "with": "plane spacing", "expected": 1, "found": head["depth_order_in_planes"]},
         {"error": "colour", "with": "plane spacing", "expected": 1, "found": head["color_order_in_planes"]},
@@ -174,8 +173,8 @@ cameras up to 0.53 units from the MPI, 432 rays each; errors are means over all 
     ]
     columns = {"error": "{error}", "falls with": "{with}", "expected order": "{expected}", "observed": "{found:.2f}"}
     half = f"""\
-The first plane inside a solid is hit, so the depth error should be half a plane's spacing along the ray: the
-finest is {head["depth_error_over_expected"]:.2f} times that. Of all added MPIs the least helpful changed an error by \
+The expected depth error is half a plane spacing along the ray; the finest is \
+{head["depth_error_over_expected"]:.2f} times that. The least helpful of all added MPIs changed an error by \
 {100 * head["largest_change_with_an_added_mpi"]:+.0f} % (merged jointly)."""
     planes = table(
         {
@@ -193,12 +192,11 @@ finest is {head["depth_error_over_expected"]:.2f} times that. Of all added MPIs 
     for form in FORMS:
         by_form |= {f"{form}: depth": f"{{{form}[depth_error]:.2e}}", f"{form}: colour": f"{{{form}[color_error]:.2e}}"}
     merged = """\
-K MPIs of 17 planes around the cameras. *Joint*: merged without reliability, as trained together. *Blended*:
-with equal reliability everywhere, before it has learned anything. It then lets (1 - 1/K)^K of the light
-through K opaque samples and mixes in what lies deeper."""
-    blocks = [said, table(columns, orders), half, "![Errors over planes, texels and MPIs](accuracy.png)"]
+K MPIs of 17 planes around the cameras. *Joint*: merged without reliability. *Blended*: with equal reliability
+everywhere, so that K opaque samples have a transmittance of (1 - 1/K)^K."""
+    blocks = [intro, table(columns, orders), half, "![Errors over planes, texels and MPIs](accuracy.png)"]
     blocks += ["## Planes", "One MPI, 121 x 97 texels.", planes, "## Texels"]
-    blocks += ["A flat wall that lies in a plane of the MPI: only the texture is interpolated."]
+    blocks += ["A flat wall in a plane of the MPI: only the texture is interpolated."]
     blocks += [table(texels, rows["texels"]), "## MPIs", merged, table(by_form, rows["mpis"])]
     return page("Accuracy on exact geometry", made, blocks)
 

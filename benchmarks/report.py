@@ -141,10 +141,13 @@ def page(title: str, made: Row, *blocks: str | list[str]) -> str:
 def table(columns: Mapping[str, Cell], rows: Iterable[Row]) -> str:
     """A Markdown table: columns by heading, a line for each row."""
     lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
-    for row in rows:
-        cells = (cell.format(**row) if isinstance(cell, str) else str(cell(row)) for cell in columns.values())
-        lines.append(f"| {' | '.join(cells)} |")
+    lines += [f"| {' | '.join(cell(column, row) for column in columns.values())} |" for row in rows]
     return "\n".join(lines)
+
+
+def cell(column: Cell, row: Row) -> str:
+    """Text of one column of a row."""
+    return column.format(**row) if isinstance(column, str) else str(column(row))
 
 
 def slug(text: str, between: str = "_") -> str:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from numpy.typing import NDArray
-from report import Bench, Report, Row, page, table
+from report import Bench, Report, Row, cell, page, table
 from torch import Tensor
 
 from mmpi_ns.data.checks import check_transforms
@@ -160,7 +160,12 @@ def markdown(content: Row) -> str:
         "remark": "{remark}",
     }
     rows = list(content["rows"].values())
-    return page("Images rendered by other programs", content["made"], PROTOCOL, table(columns, rows))
+    values = {name: {cell(columns[name], row) for row in rows} for name in columns}
+    equal = {name: v.pop() for name, v in values.items() if len(rows) > 1 and len(v) == 1}
+    same = f"In all rows: {', '.join(f'{name} {value}' for name, value in equal.items())}." if equal else ""
+    made = content["made"] | {"command": "python benchmarks/score.py"}  # the rows in score.json have their options
+    columns = {name: c for name, c in columns.items() if name not in equal}
+    return page("Images rendered by other programs", made, PROTOCOL, same, table(columns, rows))
 
 
 if __name__ == "__main__":

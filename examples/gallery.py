@@ -98,11 +98,10 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     lines = [f"| {' | '.join(cell.format(**row) for cell in COLUMNS.values())} |" for row in rows]
     parts = [
         "# Gallery",
-        "Four procedural scenes, trained for minutes on one core. PSNR and SSIM are means over the test images. The "
-        "exact depths are not used.",
+        "Four procedural scenes, trained for minutes on one core; means over the test images. The exact depths are not "
+        "used.",
         "\n".join([f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS), *lines]),
-        f"Made by `make gallery` on {processor()}, commit {commit}; seconds are from the start of `ns-train` to its "
-        "last checkpoint, beside other programs.",
+        f"Made by `make gallery` on {processor()}, commit {commit}; seconds of `ns-train`, on a shared machine.",
     ]
     for row in rows:
         name = row["name"]
