@@ -82,8 +82,8 @@ def environment_of(threads: int) -> dict[str, str]:
 def main(module: str, function: str, source: str, target: str) -> None:
     """The other end: does the work and writes what it returns."""
     work: Work = getattr(importlib.import_module(module), function)
-    found = work(read_json(Path(source)), lambda text: print(f"{PROGRESS}{text}", flush=True))
-    Path(target).write_text(json.dumps(found), encoding="utf-8")
+    results = work(read_json(Path(source)), lambda text: print(f"{PROGRESS}{text}", flush=True))
+    Path(target).write_text(json.dumps(results), encoding="utf-8")
 
 
 if __name__ == "__main__":

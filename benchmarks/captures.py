@@ -109,9 +109,9 @@ def catalogue() -> dict[str, Capture]:
         Capture("loop", "room", False, count=64),
         Capture("orbit", "object", False, count=48),
     ]
-    found: dict[str, Capture] = {}
+    results: dict[str, Capture] = {}
     for capture in base:
-        found[capture.name] = capture
-        found[f"{capture.name}-half"] = replace(capture, name=f"{capture.name}-half", half=True)
-        found[f"{capture.name}-second"] = replace(capture, name=f"{capture.name}-second", step=2)
-    return found
+        results[capture.name] = capture
+        results[f"{capture.name}-half"] = replace(capture, name=f"{capture.name}-half", half=True)
+        results[f"{capture.name}-second"] = replace(capture, name=f"{capture.name}-second", step=2)
+    return results

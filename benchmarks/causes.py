@@ -67,12 +67,12 @@ def causes(pipeline: Any, count: int) -> Row:
     posed = posed_images(manager.observations, training)
     if posed is None:
         raise InputError("A camera of this capture is neither perspective nor fisheye: no pixel can be looked up.")
-    shown = [model.get_outputs_for_camera(training.cameras[i : i + 1]) for i in range(len(training))]
-    distances = [outputs["depth"][..., 0].cpu().numpy() for outputs in shown]
+    renderings = [model.get_outputs_for_camera(training.cameras[i : i + 1]) for i in range(len(training))]
+    distances = [outputs["depth"][..., 0].cpu().numpy() for outputs in renderings]
     scores: dict[str, list[float]] = {name: [] for name in CAUSES}
     for i in np.linspace(0, len(training) - 1, min(count or len(training), len(training))).round().astype(int):
         factor = model.exposures.factors[i] if len(model.exposures.factors) else 1.0
-        rgb = (factor * shown[i].get("radiance", shown[i]["rgb"])).clamp(0, 1)
+        rgb = (factor * renderings[i].get("radiance", renderings[i]["rgb"])).clamp(0, 1)
         scores["training images"].append(psnr_of(squared(rgb, training.get_image_float32(int(i))[..., :3])))
     parts = []
     for i, (camera, image) in enumerate(images_of(pipeline, count)):
@@ -85,7 +85,7 @@ def causes(pipeline: Any, count: int) -> Row:
         for name, error in (
             ("test images", plain),
             ("... colours fitted", squared(color_correct(outputs["rgb"], image), image)),
-            ("... own pose refined", squared(again["rgb"], image)),
+            ("... poses refined", squared(again["rgb"], image)),
             ("... both", fitted),
         ):
             scores[name].append(psnr_of(error))
@@ -108,7 +108,7 @@ CAUSES = (
     "training images",
     "test images",
     "... colours fitted",
-    "... own pose refined",
+    "... poses refined",
     "... both",
     *(f"pixels that {least} or more training images see" for least in (1, 2, 3)),
     "both, pixels that 2 or more see",
@@ -134,10 +134,10 @@ def times_seen(camera: Any, distance: NDArray[np.float32], posed: Any, distances
     rays = camera.to("cpu").generate_rays(0, keep_shape=True)
     points = (rays.origins + rays.directions * torch.from_numpy(distance)[..., None]).double().numpy()
     points, seen = points.reshape(-1, 3), np.zeros(distance.size, np.int64)
-    for j, shown in enumerate(distances):
+    for j, renderings in enumerate(distances):
         at = project(posed, j, points)
         own = np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1)
-        there = look_up(shown, *at.T, nearest=True)
+        there = look_up(renderings, *at.T, nearest=True)
         seen += (there > 0) & (there > (1 - SAME_DISTANCE) * own)
     return seen.reshape(distance.shape)
 
@@ -161,20 +161,19 @@ def markdown(content: Row) -> str:
     rows = content["rows"]
 
     def columns(show: Callable[[Row, str], str]) -> dict[str, Any]:
-        return {scene: (lambda row, r=found: show(r, row["name"])) for scene, found in rows.items()}
+        return {scene: (lambda row, r=results: show(r, row["name"])) for scene, results in rows.items()}
 
     first = {"PSNR, dB": "{name}"} | columns(lambda r, name: f"{r['psnr'][name]:.2f}")
     second = {"share of the pixels, and of the squared error": "{name}"} | columns(
         lambda r, name: f"{r['pixels'][name]:.0%}, {r['error'][name]:.0%}"
     )
-    said = (
+    intro = (
         f"Means over {f'at most {n} evenly spaced' if (n := content['images']) else 'all'} test images (and training "
-        "images) of the field alone, without details. Colours: by the affine map "
-        "that suits each image best. Pose: where the frozen model shows the image best. Training images see a point, "
-        "by the model's own depth, where they show nothing that is more than 5 % nearer."
+        "images) of the field without details. Colours are fitted by an affine map, poses by "
+        "the frozen model. A training image sees a point if its rendered depth there is not more than 5 % nearer."
     )
     tables = [table(first, ({"name": n} for n in CAUSES)), table(second, ({"name": n} for n in PARTS))]
-    return page("Causes of error", content["made"], said, *tables)
+    return page("Causes of error", content["made"], intro, *tables)
 
 
 if __name__ == "__main__":

@@ -27,8 +27,8 @@ class Curve:
         common = set.intersection(*({point["step"] for point in row["curve"]} for row in rows))
 
         def table(name: str) -> Array:
-            shown = [[point[name] for point in row["curve"] if point["step"] in common] for row in rows]
-            return np.array(shown, np.float64)
+            rendered = [[point[name] for point in row["curve"] if point["step"] in common] for row in rows]
+            return np.array(rendered, np.float64)
 
         psnr = table("psnr")
         seconds = table("seconds").mean(0)
@@ -62,17 +62,17 @@ class Curve:
 def compare(ours: list[Curve], peer: Curve, name: str) -> dict[str, float]:
     """How we stand to a peer: at equal time, and how long we take to the PSNR that the peer ends with. Of ours, runs of
     several lengths (a schedule follows the length), the best counts."""
-    found: dict[str, float] = {}
+    results: dict[str, float] = {}
     equal = min(peer.seconds[-1], max(c.seconds[-1] for c in ours))
     theirs, here = peer.at(equal), [c.at(min(equal, c.seconds[-1])) for c in ours]
     reached = [x for x in here if x is not None]
     if theirs is not None and reached:
-        found |= {"equal_time_s": float(equal), "delta_at_equal_time_db": max(reached) - theirs}
+        results |= {"equal_time_s": float(equal), "delta_at_equal_time_db": max(reached) - theirs}
     times = [t for t in (c.reaches(float(peer.psnr[-1])) for c in ours) if t is not None]
     if times:
-        found[f"seconds_to_{name}_psnr"] = min(times)
-        found[f"time_ratio_to_{name}_psnr"] = float(peer.seconds[-1]) / min(times)
+        results[f"seconds_to_{name}_psnr"] = min(times)
+        results[f"time_ratio_to_{name}_psnr"] = float(peer.seconds[-1]) / min(times)
     gain = peer.last_gain()
     if gain is not None:
-        found[f"{name}_last_gain_db_per_1000_steps"] = gain
-    return found
+        results[f"{name}_last_gain_db_per_1000_steps"] = gain
+    return results

@@ -116,12 +116,12 @@ def markdown(content: Row) -> str:
         "over three expected errors": percent("beyond"),
         "processor s an image": "{seconds_an_image:.2f}",
     }
-    said = (
+    intro = (
         "Procedural captures are of the same way, with fewer images farther apart, and have 25 SfM points an image. "
         "Depths are from points, matches, surfaces and what is extrapolated; errors are of inverse distances. Seconds "
         "include reading the images."
     )
-    return page("Depths", content["made"], said, table(columns, rows))
+    return page("Depths", content["made"], intro, table(columns, rows))
 
 
 if __name__ == "__main__":

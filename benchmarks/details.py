@@ -69,13 +69,13 @@ def scores(pipeline: Any, config: Path, count: int) -> Row:
         observed = images.get_data(i, image_type="float32")["image"][..., :3].to(model.device)
         camera = images.cameras[i : i + 1].to(model.device)
         bundle, field = image_rays(camera), model.get_outputs_for_camera(camera)
-        exposure = model.exposures.shown("mean", bundle)
+        exposure = model.exposures.mean
         for name, (nearest, share) in {"none": (0, 0.0), **settings(usual.nearest_images)}.items():
             start = clock()
             with mock.patch.object(details, "STRENGTH", share):
-                shown = kept.added(field, bundle, nearest, exposure) if nearest else field
+                rendered = kept.added(field, bundle, nearest, exposure) if nearest else field
             seconds = clock() - start
-            rgb = pipeline.as_exposed(camera, shown, observed)["rgb"]
+            rgb = pipeline.as_exposed(camera, rendered, observed)["rgb"]
             values.setdefault(name, []).append((psnr(rgb, observed), ssim(rgb, observed), seconds))
     means = {name: np.mean(numbers, 0).tolist() for name, numbers in values.items()}
     height, width = (int(n[0]) for n in (images.cameras.height, images.cameras.width))
@@ -109,11 +109,11 @@ def markdown(content: Row) -> str:
     for scene, row in rows.items():
         heading = f"{scene}, {row['images']} training images, {row['size'][0]} x {row['size'][1]}"
         columns[heading] = lambda line, r=row: "{:.2f} / {:.3f}, {:.3f} s".format(*r["scores"][line["name"]])
-    said = (
+    intro = (
         "PSNR, dB, and SSIM of test images, and seconds that their details take; none: the field alone. "
         f"Of a difference {details.STRENGTH:.0%} is shown unless a row says otherwise."
     )
-    return page("Details of training images", content["made"], said, table(columns, ({"name": n} for n in names)))
+    return page("Details of training images", content["made"], intro, table(columns, ({"name": n} for n in names)))
 
 
 if __name__ == "__main__":

@@ -139,12 +139,12 @@ def markdown(content: Row) -> str:
             for name in ("without", "with"):
                 key = f"{score}_{name}"
                 columns[f"{score} {name}"] = lambda row, key=key: f"{row[key]:.2f}" if key in row else ""
-    said = (
+    intro = (
         "Exposures of streets are exact: one, three-fold automatic gains with 10 % white balance, and half of the "
         "light lost in the corners. What colours differ by is the median over image pairs that were left out, "
         "after the fall-off towards the corners."
     )
-    return page("Exposure", content["made"], said, table(columns, rows))
+    return page("Exposure", content["made"], intro, table(columns, rows))
 
 
 if __name__ == "__main__":

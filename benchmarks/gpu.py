@@ -55,8 +55,8 @@ class Gpu(Bench):
             share = SHARES[name] / sum(SHARES[n] for n in self.parts[number:])
             print(f"{name}: {max(0.0, left * share):.0f} s ...", flush=True)
             begin = time.monotonic()
-            found = self._part(name, data, left * share) if left > 0 else {"not_run": "no time was left"}
-            rows[name] = {**found, "wall_s": time.monotonic() - begin}
+            results = self._part(name, data, left * share) if left > 0 else {"not_run": "no time was left"}
+            rows[name] = {**results, "wall_s": time.monotonic() - begin}
             head = {k: v for part in rows.values() for k, v in part.get("headline", {}).items()}
             report.finish(head, markdown(report.content, head))
         head = report.content["headline"]
@@ -109,11 +109,11 @@ def markdown(content: Row, head: Row) -> str:
     for name, part in parts.items():
         blocks += [f"## {title(name)} ({part['wall_s']:.0f} s)"]
         blocks += [f"Not run: {part['not_run']}"] if "not_run" in part else []
-        for said, rows in part.get("tables", {}).items():
+        for intro, rows in part.get("tables", {}).items():
             names = dict.fromkeys(k for row in rows.values() for k in row)
             columns = {"of": "{row}"}
             columns |= {n.replace("_", " "): lambda r, n=n: _number(r.get(n)) for n in names}
-            blocks += [said, table(columns, ({"row": name, **row} for name, row in rows.items()))]
+            blocks += [intro, table(columns, ({"row": name, **row} for name, row in rows.items()))]
     numbers = ({"name": name, "value": _number(value)} for name, value in head.items())
     return page("On a GPU", content["made"], blocks, "## Headline", table({"": "{name}", "value": "{value}"}, numbers))
 

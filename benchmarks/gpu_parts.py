@@ -47,14 +47,14 @@ def interpret(on: bool) -> None:
 
 def check(request: Row, tell: Tell) -> Row:
     """Correctness first."""
-    found = run_checks(request["device"], request["rehearse"])
-    rows, failed = found["checks"], found["failed"]
+    results = run_checks(request["device"], request["rehearse"])
+    rows, failed = results["checks"], results["failed"]
     for row in rows:
         if not row["ok"]:
             tell(f"FAIL {row}")
-    shown = {r["name"]: {"error": r["error"], "bound": r["bound"], "": "ok" if r["ok"] else "FAIL"} for r in rows}
-    said = f"{len(rows)} comparisons with float64, {failed} failed."
-    return {"headline": {"checks": len(rows), "failed_checks": failed}, "tables": {said: shown}, **found}
+    rendered = {r["name"]: {"error": r["error"], "bound": r["bound"], "": "ok" if r["ok"] else "FAIL"} for r in rows}
+    intro = f"{len(rows)} comparisons with float64, {failed} failed."
+    return {"headline": {"checks": len(rows), "failed_checks": failed}, "tables": {intro: rendered}, **results}
 
 
 # Training ------------------------------------------------------------------------------------------------------------
@@ -123,8 +123,8 @@ def train_for(steps: Steps, total: int, ends: float) -> Row:
     times = time_stages(steps, [model.progress.schedule.sharpened(s) for s in range(total)], ends, 40)
     rates = {late: 1 / statistics.median(seconds) for late, seconds in times.items()}
     early, late = rates.get(False), rates.get(True, rates.get(False, 0.0))
-    found = {"steps": steps.step, "early_steps_per_s": early, "late_steps_per_s": late}
-    return found | {"texels": model.field.full_plan.texels, **memory()}
+    results = {"steps": steps.step, "early_steps_per_s": early, "late_steps_per_s": late}
+    return results | {"texels": model.field.full_plan.texels, **memory()}
 
 
 def memory() -> dict[str, float]:
@@ -158,7 +158,7 @@ def render_both(steps: Steps, path: str, repeats: int) -> Row:
     frame_s, rgb = median_s(render, repeats), render()
     larger = copy.deepcopy(camera)
     larger.rescale_output_resolution(FULL_WIDTH / rgb.shape[1] if repeats > 1 else 0.5)
-    found = {
+    results = {
         "frame_ms": 1e3 * frame_s,
         "frame_pixels": rgb.shape[0] * rgb.shape[1],
         "psnr": psnr(rgb, truth)["psnr"],
@@ -169,10 +169,10 @@ def render_both(steps: Steps, path: str, repeats: int) -> Row:
         dispatch.choose("torch")
         plain = render()
         dispatch.choose("auto")
-        found["largest_difference"] = float((rgb - plain).abs().max())
-        found["psnr_delta_db"] = found["psnr"] - psnr(plain, truth)["psnr"]
+        results["largest_difference"] = float((rgb - plain).abs().max())
+        results["psnr_delta_db"] = results["psnr"] - psnr(plain, truth)["psnr"]
     pipeline.train()
-    return found
+    return results
 
 
 def measure_kitti(request: Row, tell: Tell) -> Row:
@@ -195,8 +195,8 @@ def measure_kitti(request: Row, tell: Tell) -> Row:
         head |= {f"kitti_{reading}_{n}": value for n, value in memory().items()}
         tell(f"{reading}: {row}")
         del steps
-    said = "The paper's KITTI size, its schedule in fewer steps, and what 40,000 would take."
-    return {"headline": head, "tables": {said: facts, **tables}}
+    intro = "The paper's KITTI size, its schedule in fewer steps, and what 40,000 would take."
+    return {"headline": head, "tables": {intro: facts, **tables}}
 
 
 def time_phases(steps: Steps, total: int, ends: float) -> tuple[Row, Row]:

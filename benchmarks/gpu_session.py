@@ -162,23 +162,23 @@ def main() -> int:
         todo.insert(int(todo[0].name == "device"), install(given.wheels.resolve(), work / "site"))
     carried = {"data": mib(given.data), "wheels": mib(given.wheels)}
     print({name: round(size, 1) for name, size in carried.items()}, "MiB carried", flush=True)
-    found: dict[str, dict[str, object]] = {}
+    results: dict[str, dict[str, object]] = {}
     for part in todo:
         left = given.seconds - (time.monotonic() - start)
-        said: dict[str, object] = {"status": None, "wall_s": 0.0, "output": "no time was left"}
+        intro: dict[str, object] = {"status": None, "wall_s": 0.0, "output": "no time was left"}
         if left > 5:
             seconds = left if given.rehearse else min(part.seconds, left)
-            said = run_part(part, seconds, out / "logs" / f"{part.name}.txt")
-        found[part.name] = {"command": part.words, **said}
+            intro = run_part(part, seconds, out / "logs" / f"{part.name}.txt")
+        results[part.name] = {"command": part.words, **intro}
         for log in work.rglob("output.log"):
             shutil.copy(log, out / "logs" / f"{'-'.join(log.relative_to(work).parts[:-1])[-120:]}.log")
-        report = {"command": sys.argv, "rehearsal": given.rehearse, "carried_mib": carried, "parts": found}
+        report = {"command": sys.argv, "rehearsal": given.rehearse, "carried_mib": carried, "parts": results}
         report["wall_s"] = time.monotonic() - start
         (out / "session.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
-        print(f"{part.name}: status {said['status']}, {said['wall_s']:.0f} s", flush=True)
-    needed = [name for name in found if name != "device" or not given.rehearse]
+        print(f"{part.name}: status {intro['status']}, {intro['wall_s']:.0f} s", flush=True)
+    needed = [name for name in results if name != "device" or not given.rehearse]
     shutil.rmtree(work, ignore_errors=True)
-    return int(any(found[name]["status"] != 0 for name in needed))
+    return int(any(results[name]["status"] != 0 for name in needed))
 
 
 if __name__ == "__main__":

@@ -43,25 +43,25 @@ def costs(device: str) -> dict:
     """Of a launch and of a node of a graph."""
     x, y = torch.ones(2, 1024, device=device)
     out, leaf = torch.empty_like(x), torch.ones(1024, device=device, requires_grad=True)
-    found = {"add": microseconds(lambda: torch.add(x, y, out=out)), "add, new": microseconds(lambda: x + y)}
-    found["add, forward and backward"] = microseconds(lambda: torch.autograd.grad((leaf + y).sum(), leaf))
+    results = {"add": microseconds(lambda: torch.add(x, y, out=out)), "add, new": microseconds(lambda: x + y)}
+    results["add, forward and backward"] = microseconds(lambda: torch.autograd.grad((leaf + y).sum(), leaf))
     for nodes in NODES if device == "cuda" else ():
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
             for _ in range(nodes):
                 torch.add(x, y, out=out)
-        found[f"graph of {nodes}"] = microseconds(graph.replay, 100)
-    return found
+        results[f"graph of {nodes}"] = microseconds(graph.replay, 100)
+    return results
 
 
 def busy(steps: Steps) -> dict:
     """Milliseconds that the GPU works in a step, its kernels, the largest of them, and what is waited for."""
-    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as found:
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as results:
         steps.run(PROFILED)
-    on_gpu = [e for e in found.key_averages() if e.device_type == torch.autograd.DeviceType.CUDA]
+    on_gpu = [e for e in results.key_averages() if e.device_type == torch.autograd.DeviceType.CUDA]
     on_gpu.sort(key=lambda e: -e.self_device_time_total)
     torch.cuda.set_sync_debug_mode("warn")
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as intro:
         warnings.simplefilter("always")
         steps.run(1)
     torch.cuda.set_sync_debug_mode("default")
@@ -69,27 +69,32 @@ def busy(steps: Steps) -> dict:
         "busy_ms": sum(e.self_device_time_total for e in on_gpu) / PROFILED / 1e3,
         "kernels": sum(e.count for e in on_gpu) / PROFILED,
         "largest_ms": {e.key[:80]: e.self_device_time_total / PROFILED / 1e3 for e in on_gpu[:20]},
-        "waits": [f"{Path(w.filename).name}:{w.lineno}" for w in said if "synchroniz" in str(w.message)],
+        "waits": [f"{Path(w.filename).name}:{w.lineno}" for w in intro if "synchroniz" in str(w.message)],
     }
 
 
 def alternating(steps: Steps) -> dict:
     """Milliseconds of a step by both ways, and their profiles."""
     trainer, graphs = steps.trainer, steps.trainer._graphs
-    found: dict = {"by operations": {"ms": []}, "graphs": {"ms": []}}
+    results: dict = {"by operations": {"ms": []}, "graphs": {"ms": []}}
     for _ in range(ROUNDS):
         for name, each in (("by operations", None), ("graphs", graphs)):
             trainer._graphs = each
             steps.run(8)  # what is not recorded is measured and recorded
-            found[name]["ms"].append(1e3 * steps.run(STEPS) / STEPS)
+            results[name]["ms"].append(1e3 * steps.run(STEPS) / STEPS)
     for name, each in (("by operations", None), ("graphs", graphs)) if torch.cuda.is_available() else ():
         trainer._graphs = each
         steps.run(4)
-        found[name] |= busy(steps)
+        results[name] |= busy(steps)
     trainer._graphs = graphs
     if graphs is not None:
-        found |= {"off": graphs.is_off, "repeated": graphs.repeated, "lost": graphs.lost, "room": str(graphs.capacity)}
-    return found
+        results |= {
+            "off": graphs.is_off,
+            "repeated": graphs.repeated,
+            "lost": graphs.lost,
+            "room": str(graphs.capacity),
+        }
+    return results
 
 
 def main() -> None:
@@ -101,11 +106,11 @@ def main() -> None:
     options.add_argument("--stages", type=int, nargs="*", default=[], help="steps after which both ways alternate")
     options.add_argument("--out", type=Path, required=True, help="a JSON file")
     given, device = options.parse_args(), "cuda" if torch.cuda.is_available() else "cpu"
-    found: dict = {}
+    results: dict = {}
 
     def note(name, value) -> None:
-        found[name] = value
-        given.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
+        results[name] = value
+        given.out.write_text(json.dumps(results, indent=1), encoding="utf-8")
         print(name, value, flush=True)
 
     if given.what == "costs":

@@ -85,12 +85,12 @@ def train_and_evaluate(
     place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
     size = ["--data", str(scene.data), "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
     used = run_command([train, method, *place, *options, *size], folder / "train.log", threads)
-    run, found = folder / "run" / method / "1", folder / "eval.json"
-    words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(found), *asked]
+    run, results = folder / "run" / method / "1", folder / "eval.json"
+    words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(results), *asked]
     run_command(words, folder / "eval.log", threads)
     made = {"train_seconds": used.seconds, "processor_seconds": used.processor_seconds, "gib": used.gib}
     made |= {"threads": threads, "processor": processor(), "commit": commit()}
-    return run, read_json(found)["results"], made | {"date": date.today().isoformat()}
+    return run, read_json(results)["results"], made | {"date": date.today().isoformat()}
 
 
 def end_helpers(trainer: Any) -> None:

@@ -106,11 +106,13 @@ def run_command(command: list[str], folder: Path) -> dict[str, Any]:
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         errors.seek(0)
-        said = [line for line in errors.read().splitlines() if line.strip()]
+        intro = [line for line in errors.read().splitlines() if line.strip()]
     outcome = "well"
     if process.returncode:
-        is_sentence = not any("Traceback" in line for line in said) and said and said[-1].startswith(f"{command[0]}: ")
-        outcome = said[-1] if is_sentence else f"TRACEBACK: {said[-1] if said else process.returncode}"
+        is_sentence = (
+            not any("Traceback" in line for line in intro) and intro and intro[-1].startswith(f"{command[0]}: ")
+        )
+        outcome = intro[-1] if is_sentence else f"TRACEBACK: {intro[-1] if intro else process.returncode}"
     return {"outcome": outcome, "seconds": usage.ru_utime + usage.ru_stime, "gib": usage.ru_maxrss / 2**20}
 
 

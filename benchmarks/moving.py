@@ -113,9 +113,9 @@ def masked_shares(data: Path, downscale_factor: int) -> Row:
     truths = [data / "moving" / Path(name).name for name in dataset.image_filenames]
     if truths[0].is_file():
         truth = np.stack([np.asarray(Image.open(path)) for path in truths])
-        shown = np.stack(masks)
-        row |= {"moving": float((truth == MOVER).mean()), "of_moving": float(shown[truth == MOVER].mean())}
-        row |= {"of_static": float(shown[truth == 0].mean())}
+        rendered = np.stack(masks)
+        row |= {"moving": float((truth == MOVER).mean()), "of_moving": float(rendered[truth == MOVER].mean())}
+        row |= {"of_static": float(rendered[truth == 0].mean())}
     return row
 
 
@@ -144,7 +144,7 @@ def markdown(content: Row) -> str:
         "... of which matching": lambda row: f"{row['matching_an_image']:.2f}" if "matching_an_image" in row else "",
     }
     trained = {"training": "{name}", "PSNR": "{psnr:.2f}", "SSIM": "{ssim:.3f}", "s": "{train_seconds:.0f}"}
-    said = (
+    intro = (
         "Movers of procedural streets are known exactly; what stands is without their shadows. Asked are 90 % of what "
         "moves and at most 2 % of what stands. Seconds are for all that finding movers takes, dense matching at its "
         "size and exposures included. Test images of the trainings show the first street without movers."
@@ -152,7 +152,7 @@ def markdown(content: Row) -> str:
     text = table(shares, [row for row in rows if "images" in row])
     if any("psnr" in row for row in rows):
         text += "\n\n" + table(trained, [row for row in rows if "psnr" in row])
-    return page("What moves", content["made"], said, text)
+    return page("What moves", content["made"], intro, text)
 
 
 if __name__ == "__main__":

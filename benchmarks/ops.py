@@ -236,13 +236,13 @@ def _adam(steps: Steps, moved: float) -> Op:
 
 def headline(rows: dict[str, Row]) -> dict[str, float]:
     """Rates of the machine, and of each operation its milliseconds and the share of its limit that it reaches."""
-    found: dict[str, float] = dict(rows["limits"])
+    results: dict[str, float] = dict(rows["limits"])
     for stage in ("early", "late"):
-        found[f"{stage}_step_ms"] = rows[stage]["step_ms"]
+        results[f"{stage}_step_ms"] = rows[stage]["step_ms"]
         for name, row in rows[stage]["ops"].items():
-            found[f"{stage}_{slug(name)}_ms"] = row["ms"]
-            found[f"{stage}_{slug(name)}_of_limit"] = row["limit_ms"] / row["ms"]
-    return found
+            results[f"{stage}_{slug(name)}_ms"] = row["ms"]
+            results[f"{stage}_{slug(name)}_of_limit"] = row["limit_ms"] / row["ms"]
+    return results
 
 
 def markdown(rows: dict[str, Row], made: Row) -> str:
@@ -258,7 +258,7 @@ def markdown(rows: dict[str, Row], made: Row) -> str:
         "limit, ms": "{limit_ms:.2f}",
         "of the limit": lambda r: f"{100 * r['limit_ms'] / r['ms']:.0f} %",
     }
-    said = f"""\
+    intro = f"""\
 A copy moves {limits["copy_gb_per_s"]:.1f} GB/s (read and written), a product of matrices makes
 {limits["matmul_gflop_per_s"]:.0f} GFLOP/s. The limit of an operation is the time of its bytes (every number that it
 reads or writes once) at the one rate or of its sums at the other, whichever is longer. Rows are read by the cache line,
@@ -273,7 +273,7 @@ so no lookup can reach it."""
             f"{rows[stage]['step_ms']:.0f} ms."
         ]
         blocks += [table(columns, ({"name": name, **r} for name, r in rows[stage]["ops"].items()))]
-    return page("Operations of a training step against their limits", made, said, blocks, "![Operations](ops.png)")
+    return page("Operations of a training step against their limits", made, intro, blocks, "![Operations](ops.png)")
 
 
 def draw(path: Path, rows: dict[str, Row]) -> None:

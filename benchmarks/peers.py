@@ -71,8 +71,8 @@ def give_depths(data: Path, downscale_factor: int) -> None:
     inverse = {name: torch.from_numpy(known.image(i)[..., :1]) for i, name in enumerate(names)}
 
     def depth_of(self: Any, batch: dict[str, Any]) -> dict[str, Tensor]:
-        found = inverse.get(self.image_filenames[batch["image_idx"]], torch.zeros_like(batch["image"][..., :1]))
-        return {"depth_image": torch.where(found > 0, 1 / found, 0.0)}
+        results = inverse.get(self.image_filenames[batch["image_idx"]], torch.zeros_like(batch["image"][..., :1]))
+        return {"depth_image": torch.where(results > 0, 1 / results, 0.0)}
 
     DepthDataset.__init__ = InputDataset.__init__  # type: ignore[method-assign]
     DepthDataset.get_metadata = depth_of  # type: ignore[method-assign]
@@ -95,8 +95,8 @@ def hash_lookups(self: Any, in_tensor: Tensor) -> Tensor:
     for begin in range(0, len(positions), AT_ONCE):
         part = slice(begin, begin + AT_ONCE)
         rows[part], weights[part] = hash_rows(self, positions[part])
-    found = weigh_rows(self.hash_table, rows.view(-1, 8), weights.view(-1, 8))
-    return found.view(*in_tensor.shape[:-1], -1)
+    results = weigh_rows(self.hash_table, rows.view(-1, 8), weights.view(-1, 8))
+    return results.view(*in_tensor.shape[:-1], -1)
 
 
 def hash_rows(encoding: Any, positions: Tensor) -> tuple[Tensor, Tensor]:

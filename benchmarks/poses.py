@@ -103,10 +103,10 @@ def write_scene(data: Path, folder: Path, test_images: int, degrees: float = 0.0
 def moved(poses: Array, moves: Array) -> Array:
     """Poses [N, 4, 4] turned and moved about the world's axes by ``moves`` [N, 6], as nerfstudio's optimiser does."""
     change = exp_map_SO3xR3(torch.from_numpy(moves)).numpy()
-    found = np.array(poses, np.float64)
-    found[:, :3, :3] = change[:, :, :3] @ found[:, :3, :3]
-    found[:, :3, 3] += change[:, :, 3]
-    return found
+    estimates = np.array(poses, np.float64)
+    estimates[:, :3, :3] = change[:, :, :3] @ estimates[:, :3, :3]
+    estimates[:, :3, 3] += change[:, :, 3]
+    return estimates
 
 
 def training_poses(scene: Path) -> Array:
@@ -121,15 +121,15 @@ def pose_errors(exact: Path, scene: Path, run: Path) -> Row:
     the capture."""
     told = json.loads((run / "dataparser_transforms.json").read_text(encoding="utf-8"))
     to_run, scale = np.vstack([told["transform"], [0, 0, 0, 1]]), told["scale"]
-    wanted, found = (to_run @ training_poses(folder) for folder in (exact, scene))
+    wanted, estimates = (to_run @ training_poses(folder) for folder in (exact, scene))
     last = max((run / "nerfstudio_models").glob("step-*.ckpt"))
     state = torch.load(last, map_location="cpu", weights_only=True)["pipeline"]
     moves = state.get("_model.camera_optimizer.pose_adjustment")
     if moves is not None:
         numbers = moves.double().numpy()
-        found = moved(found, np.concatenate([numbers[:, :3] / scale, numbers[:, 3:]], -1))
-    turned = degrees_between(wanted[:, :3, :3], found[:, :3, :3])
-    off = np.linalg.norm(wanted[:, :3, 3] - found[:, :3, 3], axis=-1)
+        estimates = moved(estimates, np.concatenate([numbers[:, :3] / scale, numbers[:, 3:]], -1))
+    turned = degrees_between(wanted[:, :3, :3], estimates[:, :3, :3])
+    off = np.linalg.norm(wanted[:, :3, 3] - estimates[:, :3, 3], axis=-1)
     return {"degrees_off": float(turned.mean()), "distance_off": float(off.mean())}
 
 
@@ -146,13 +146,13 @@ def markdown(content: Row) -> str:
         "by, degrees": "{refined_rotation_degrees:.2f}",
     }
     rows = [{"name": name, **row} for name, row in content["rows"].items()]
-    said = (
+    intro = (
         "Errors of training poses are means, against the scene's own poses. PSNR and SSIM are `ns-eval`'s means over "
         "the test images, at the scene's own poses. For the last three columns each test image's pose was moved to "
         "where the frozen model shows it best: what the model knows of the scene "
         "whatever frame its poses drifted to, and no score of new views at given poses."
     )
-    return page("Refined poses", content["made"], said, table(columns, rows))
+    return page("Refined poses", content["made"], intro, table(columns, rows))
 
 
 if __name__ == "__main__":

@@ -87,8 +87,8 @@ def run_prepare(images: Path, scene: Path, options: list[str]) -> Row:
     command = [sys.executable, "-m", "mmpi_prepare.__main__", str(images), str(scene), *options]
     made = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "120"})
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    said = [line for line in made.stdout.splitlines() if line.startswith(("mmpi-prepare:", "This scene is"))]
-    row: Row = {"grade": GRADES.get(made.returncode, f"status {made.returncode}"), "says": " ".join(said)}
+    intro = [line for line in made.stdout.splitlines() if line.startswith(("mmpi-prepare:", "This scene is"))]
+    row: Row = {"grade": GRADES.get(made.returncode, f"status {made.returncode}"), "says": " ".join(intro)}
     row |= {"seconds": time.monotonic() - start}
     return row | {"cpu_seconds": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
 
@@ -99,9 +99,9 @@ def compare(scene: Path, truth: Truth) -> Row:
     if not path.is_file():
         return {"registered": 0}
     meta: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    found = {Path(f["file_path"]).name: np.array(f["transform_matrix"]) for f in meta["frames"]}
-    kept = [i for i, name in enumerate(truth.names) if name in found]
-    poses: Array = np.array([found[truth.names[i]] for i in kept], dtype=np.float64)
+    results = {Path(f["file_path"]).name: np.array(f["transform_matrix"]) for f in meta["frames"]}
+    kept = [i for i, name in enumerate(truth.names) if name in results]
+    poses: Array = np.array([results[truth.names[i]] for i in kept], dtype=np.float64)
     off, turned = pose_errors(poses[:, :3, 3], poses[:, :3, :3] * [1.0, -1.0, -1.0], truth, kept)
     track = float(np.linalg.norm(np.diff(truth.centers, axis=0), axis=-1).sum())
     return {

@@ -198,7 +198,7 @@ def fill(page: Path, parts: dict[str, str]) -> None:
         place = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
         if not place.search(text):
             raise ValueError(f"{page} has no place for {name}.")
-        text = place.sub(lambda found, part=part: f"{found[1]}\n{part}\n\n{found[2]}", text)
+        text = place.sub(lambda match, part=part: f"{match[1]}\n{part}\n\n{match[2]}", text)
     page.write_text(text, encoding="utf-8")
 
 

@@ -115,7 +115,7 @@ class Train(Bench):
         # Runs that can go on from shorter ones share a folder with them.
         name = key.replace(f"{steps} steps, ", "", 1) if self._goes_on(method) else key
         request = self._request(scene, method, steps, seed, self.folder / slug(name, "-"))
-        row |= stamp(self) | {"device": self._device, "options": request.shown}
+        row |= stamp(self) | {"device": self._device, "options": request.rendered}
         if self._device == "cuda":
             row["gpu"] = torch.cuda.get_device_name()
         return row | train_apart(request, self.cores)
@@ -136,13 +136,13 @@ class Train(Bench):
 
 def _by_name(words: tuple[str, ...], option: str) -> dict[str, list[int]]:
     """name=number words, several numbers a name."""
-    found: dict[str, list[int]] = {}
+    results: dict[str, list[int]] = {}
     for word in words:
         name, _, number = word.partition("=")
         if not number.isdigit() or not int(number):
             raise ValueError(f"--{option} {word}: write it as nerfacto=1500.")
-        found.setdefault(find_method(name).name, []).append(int(number))
-    return found
+        results.setdefault(find_method(name).name, []).append(int(number))
+    return results
 
 
 def check_equal_data(rows: dict[str, Row]) -> None:

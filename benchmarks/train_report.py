@@ -45,40 +45,40 @@ class Group:
 
 def tables(rows: dict[str, Row]) -> dict[tuple[str, str], list[Group]]:
     """All that ran, by scene and setting, in the order in which methods were first named."""
-    found: dict[tuple[str, str, str, int], Group] = {}
+    results: dict[tuple[str, str, str, int], Group] = {}
     for key, row in rows.items():
         # 0 images stand for all of them.
         setting = key.partition("; ")[2].replace("of 0 images", "of every test image")
         setting = setting.replace(", 0 whole", ", all whole at the end")
         where = (f"{row['scene']} /{row['downscale_factor']}", setting, row["method"], row["steps"])
         if "not_run" not in row:
-            found.setdefault(where, Group(*where, [])).rows.append(row)
+            results.setdefault(where, Group(*where, [])).rows.append(row)
     result: dict[tuple[str, str], list[Group]] = {}
-    for g in sorted(found.values(), key=lambda g: (g.scene, g.setting)):
+    for g in sorted(results.values(), key=lambda g: (g.scene, g.setting)):
         result.setdefault((g.scene, g.setting), []).append(g)
     return result
 
 
 def headline(rows: dict[str, Row]) -> dict[str, float]:
     """Figures by name; a scene's name leads where there are several scenes, settings or devices."""
-    found: dict[str, float] = {}
+    results: dict[str, float] = {}
     by_table = tables(rows)
     for (scene, setting), groups in by_table.items():
         prefix = slug(scene) + "_" if len({s for s, _ in by_table}) > 1 else ""
         prefix += slug(setting) + "_" if sum(s == scene for s, _ in by_table) > 1 else ""
-        found |= {prefix + k: v for k, v in _of_table(groups).items()}
-    return found
+        results |= {prefix + k: v for k, v in _of_table(groups).items()}
+    return results
 
 
 def _of_table(groups: list[Group]) -> dict[str, float]:
     """Figures of one scene. The longest run of a method has its name, shorter ones their steps as well."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for g in groups:
         longest = max(o.steps for o in groups if o.method == g.method) == g.steps
         name = slug(g.method) + ("" if longest else f"_{g.steps}")
-        found |= {f"{name}_psnr_db": g.mean("psnr"), f"{name}_psnr_spread_db": g.spread()}
-        found |= {f"{name}_ssim": g.mean("ssim"), f"{name}_seconds": g.mean("seconds")}
-    found = {k: v for k, v in found.items() if v is not None}
+        results |= {f"{name}_psnr_db": g.mean("psnr"), f"{name}_psnr_spread_db": g.spread()}
+        results |= {f"{name}_ssim": g.mean("ssim"), f"{name}_seconds": g.mean("seconds")}
+    results = {k: v for k, v in results.items() if v is not None}
     names = [g.method for g in groups if g.rows[0]["ours"]]
     own = "mmpi-small" if "mmpi-small" in names else next(iter(names), "")
     ours = [g for g in groups if g.method == own]
@@ -91,8 +91,8 @@ def _of_table(groups: list[Group]) -> dict[str, float]:
         compared["delta_at_end_db"] = max(g.mean("psnr") for g in ours) - longest.mean("psnr")
         # The peer that runs everywhere has the plain names.
         plain = peer == "nerfacto"
-        found |= {k if plain or name in k else f"{name}_{k}": v for k, v in compared.items()}
-    return found
+        results |= {k if plain or name in k else f"{name}_{k}": v for k, v in compared.items()}
+    return results
 
 
 def markdown(content: Row) -> str:
@@ -100,8 +100,8 @@ def markdown(content: Row) -> str:
     rows, blocks = content["rows"], []
     for (scene, setting), groups in tables(rows).items():
         split = groups[0].rows[0]["split"]
-        said = f"{split['train']} training and {split['test']} test images, {setting}."
-        blocks += [f"## {scene}", said, table(_COLUMNS, ({"g": g} for g in groups))]
+        intro = f"{split['train']} training and {split['test']} test images, {setting}."
+        blocks += [f"## {scene}", intro, table(_COLUMNS, ({"g": g} for g in groups))]
         blocks += ["PSNR (on the way) after so many seconds:", _times(groups)]
     commits = sorted({f"{r['commit']} ({r['date']})" for r in rows.values() if "commit" in r})
     commands = dict.fromkeys(r["command"] for r in rows.values() if "command" in r)
@@ -163,18 +163,18 @@ def _times(groups: list[Group]) -> str:
         at = {f"{t} s": g.curve.at(t) for t in TIMES}
         row = {"": f"{g.method}, {g.steps} steps"} | {t: "" if p is None else f"{p:.2f}" for t, p in at.items()}
         rows.append(row | {"at the end": f"{g.curve.psnr[-1]:.2f} ({g.curve.seconds[-1]:.0f} s)"})
-    shown = [name for name in rows[0] if any(r[name] for r in rows)]
-    return table({name: lambda r, name=name: r[name] for name in shown}, rows)
+    rendered = [name for name in rows[0] if any(r[name] for r in rows)]
+    return table({name: lambda r, name=name: r[name] for name in rendered}, rows)
 
 
 def draw(path: Path, rows: dict[str, Row]) -> None:
     """PSNR against seconds (left) and rays (right), a row of pictures for each scene and setting."""
-    found = tables(rows)
-    if not found:
+    results = tables(rows)
+    if not results:
         return
-    methods = list(dict.fromkeys(g.method for groups in found.values() for g in groups))
-    with figure(path, len(found), 2, (11, 4 * len(found)), sharey="row") as axes:
-        for (left, right), ((scene, setting), groups) in zip(axes, found.items(), strict=True):
+    methods = list(dict.fromkeys(g.method for groups in results.values() for g in groups))
+    with figure(path, len(results), 2, (11, 4 * len(results)), sharey="row") as axes:
+        for (left, right), ((scene, setting), groups) in zip(axes, results.items(), strict=True):
             for g in groups:
                 curve, color = g.curve, f"C{methods.index(g.method) % 10}"
                 style = "-" if g.rows[0]["ours"] else "--"

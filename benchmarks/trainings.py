@@ -75,7 +75,7 @@ class Request:
         return Request(tuple(words), str(scene.data), scene.downscale_factor, str(work), **own)
 
     @property
-    def shown(self) -> str:
+    def rendered(self) -> str:
         """The words without where things lie on this machine."""
         hidden = {"--output-dir", "--data", "--experiment-name", "--timestamp"}
         return shlex.join(w for i, w in enumerate(self.words) if not {w, *self.words[max(i - 1, 0) : i]} & hidden)
@@ -122,11 +122,11 @@ class Progress:
         """That of a run in this folder from which one of ``last`` steps can go on; else none yet."""
         own = [w for i, w in enumerate(words) if i == 0 or words[i - 1] != "--max-num-iterations"]
         if known := read_json(folder / PROGRESS):
-            found = Progress(**known)
-            step = found.last["step"]
-            saved = Path(found.checkpoints) / f"step-{step - 1:09d}.ckpt"
-            if found.words == own and 0 < step < last and saved.is_file():
-                return found
+            results = Progress(**known)
+            step = results.last["step"]
+            saved = Path(results.checkpoints) / f"step-{step - 1:09d}.ckpt"
+            if results.words == own and 0 < step < last and saved.is_file():
+                return results
         return Progress(own)
 
 
@@ -205,19 +205,19 @@ def score(pipeline: Any, images: list[int], pixels: int, whole_images: bool) -> 
 def split_of(datamanager: Any) -> dict[str, Any]:
     """Which images a method trains with and is tested on: names, image size, and a hash of names, sizes, focal lengths
     and how far apart the cameras are."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     digest = hashlib.sha256()
     parts = {"train": datamanager.train_dataparser_outputs, "test": datamanager.eval_dataset._dataparser_outputs}
     for name, outputs in parts.items():
-        found[name] = [str(p) for p in outputs.image_filenames]
+        results[name] = [str(p) for p in outputs.image_filenames]
         cameras = outputs.cameras
-        digest.update(json.dumps([name, [Path(p).name for p in found[name]]]).encode())
+        digest.update(json.dumps([name, [Path(p).name for p in results[name]]]).encode())
         # Distances, since loading points may turn the world by a quarter.
         travel = (cameras.camera_to_worlds[:, :, 3] - cameras.camera_to_worlds[:1, :, 3]).norm(dim=-1)
         for value in (cameras.width, cameras.height, cameras.fx, travel):
             digest.update(np.ascontiguousarray(value.cpu().double().numpy().round(3)).tobytes())
-        found["size"] = [int(cameras.width[0]), int(cameras.height[0])]
-    return {**found, "digest": digest.hexdigest()[:16]}
+        results["size"] = [int(cameras.width[0]), int(cameras.height[0])]
+    return {**results, "digest": digest.hexdigest()[:16]}
 
 
 def check_split(split: dict[str, Any], data: Path, downscale_factor: int) -> None:
@@ -295,9 +295,9 @@ def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Tell, progre
             return
         taken = watch.read()
         with watch.stopped():
-            found = score(pipeline, evenly(count, request.check_images), request.check_pixels, request.whole_images)
-            progress.curve.append({"step": step + 1, "rays": progress.rays, **taken, "psnr": found["psnr"]})
-            tell(f"step {step + 1}: {taken['seconds']:.0f} s of training, {found['psnr']:.2f} dB")
+            results = score(pipeline, evenly(count, request.check_images), request.check_pixels, request.whole_images)
+            progress.curve.append({"step": step + 1, "rays": progress.rays, **taken, "psnr": results["psnr"]})
+            tell(f"step {step + 1}: {taken['seconds']:.0f} s of training, {results['psnr']:.2f} dB")
             if request.go_on:
                 progress.save(trainer, Path(request.work))
             if step + 1 == request.checks[-1]:

@@ -1,7 +1,7 @@
-"""The captured path in nerfstudio's viewer: where a window opens, and how one walks along the path.
+"""Initial camera of nerfstudio's viewer, and controls along the captured path.
 
-nerfstudio's viewer opens beside a scene and looks at it. MPIs show a scene from within, near the captured path. The
-element uses the viewer's two hooks: ``install``, where controls are made, and ``_setup``, where the viewer is given.
+nerfstudio's viewer opens beside a scene, looking at it. MPIs represent a scene from within, near the captured path. The
+element uses two hooks of the viewer: ``install`` creates controls, ``_setup`` receives the viewer.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ if TYPE_CHECKING:
 START = 1 / 6
 """Place on the path where a window opens: the middle of its first third."""
 LITTLE = 1 / 3
-"""Share of an image that is opaque, below which the way back to the path is offered."""
+"""Opaque share of an image below which a button back to the path appears."""
 CAMERAS_PER_SECOND = 4.0
-"""Fastest pace of Play, which goes the first content's distance in a second."""
+"""Maximum speed of Play, which moves by the distance of the first content in a second."""
 AHEAD = 0.01
-"""From the eye to the point that a drag turns about, in distances of the first content: one looks round in place."""
+"""Distance to the point that a drag rotates about, in distances of the first content: the camera stays in place."""
 NEAREST = 0.02
-"""Scene units; the page moves no nearer than half of it to that point."""
+"""Scene units; the viewer comes no nearer than half of it to that point."""
 PACE = 2.0
 """Distances of the first content that the wheel walks while the page would divide the distance ahead by e."""
 FRAMES_PER_SECOND = 10.0
-"""Poses that Play sends."""
+"""Poses a second that Play sends."""
 
 
 class View(NamedTuple):
-    """Where a window stands, looks, and what is up there. World axes; position in scene units, unit directions."""
+    """Position, viewing direction and up of a window. World axes; scene units, unit directions."""
 
     position: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
@@ -90,7 +90,7 @@ def fitting_fov(half_width: float, half_height: float, aspect: float) -> float:
 
 
 class PathControls(ViewerElement[float], ViewerControl):
-    """Opens windows on the captured path; slider, Play and Nearest camera beside the model's other controls."""
+    """Initial camera of every window, and the controls slider, Play and Nearest camera."""
 
     def __init__(self) -> None:
         super().__init__("Captured path", cb_hook=lambda _: None)
@@ -98,7 +98,7 @@ class PathControls(ViewerElement[float], ViewerControl):
         self._walker: ClientHandle | None = None
 
     def install(self, viser_server: ViserServer) -> None:
-        """Makes the controls; the viewer calls it inside the model's folder."""
+        """Creates the controls; the viewer calls it inside the model's folder."""
         gui = viser_server.gui
         self.gui_handle = self._slider = gui.add_slider("Captured path", 0.0, 1.0, 0.001, START)
         self._play = gui.add_checkbox("Play", False)
@@ -108,7 +108,7 @@ class PathControls(ViewerElement[float], ViewerControl):
         nearest.on_click(self._go_to_nearest)
 
     def _setup(self, viewer: Viewer) -> None:
-        """Is given the viewer, when all controls are made."""
+        """Receives the viewer, once all controls exist."""
         super()._setup(viewer)
         cameras: Cameras = viewer.pipeline.datamanager.train_dataset.cameras  # type: ignore[union-attr]
         path = CapturedPath(cameras.camera_to_worlds.cpu().numpy())
@@ -145,7 +145,7 @@ class PathControls(ViewerElement[float], ViewerControl):
                 camera.fov = fitting_fov(self._half_width, self._half_height, aspect)
             ahead = (camera.look_at - camera.position) / VISER_NERFSTUDIO_SCALE_RATIO
             nearer = float(np.log(self._ahead / np.linalg.norm(ahead)))  # by the wheel
-            # Of messages that were on their way when a window was moved, none moves it again.
+            # Messages sent before a window was moved do not move it again.
             if 0.01 < abs(nearer) < 0.7 and time.monotonic() - walked > 0.1:
                 walked, direction = time.monotonic(), ahead / np.linalg.norm(ahead)
                 position = camera.position / VISER_NERFSTUDIO_SCALE_RATIO + PACE * self._near * nearer * direction
@@ -182,7 +182,7 @@ class PathControls(ViewerElement[float], ViewerControl):
             Thread(target=self._keep_playing, args=[event.client], daemon=True).start()
 
     def _keep_playing(self, client: ClientHandle) -> None:
-        """Walks on until Play is off, the window is closed, or the path ends."""
+        """Moves along the path until Play is off, the window is closed, or the path ends."""
         assert self._path is not None
         length = float(np.linalg.norm(np.diff(self._path.positions, axis=0), axis=-1).sum())
         pace = min(self._near / max(length, 1e-6), CAMERAS_PER_SECOND / max(len(self._path) - 1, 1))

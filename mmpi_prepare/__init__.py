@@ -1,1 +1,1 @@
-"""From images or a video to a scene: what ``mmpi-prepare`` runs, stage by stage."""
+"""Stages of ``mmpi-prepare``, from images or a video to a scene."""

@@ -1,4 +1,4 @@
-"""``mmpi-prepare INPUT SCENE``: turns a folder of images or a video into a scene for ns-train."""
+"""Command ``mmpi-prepare INPUT SCENE``: a folder of images or a video becomes a scene for ns-train."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from mmpi_ns.scripts.command import print_version
 INTERRUPTED = "mmpi-prepare: interrupted; the same command continues from here."
 KILLED = "mmpi-prepare: ended by {}, perhaps as memory or the disk is full; the same command continues from here."
 PR_SET_PDEATHSIG = 1
-"""Of prctl: the signal that a process gets when its parent ends."""
+"""Option of prctl: the signal that a process receives when its parent ends."""
 
 
 def end_at_once_on_signals() -> None:
     """SIGINT and SIGTERM end the command with one sentence, also in the middle of COLMAP's work.
 
-    A child process goes on with the work, and is killed. A handler or a thread would wait until COLMAP returns: its
+    The work runs in a child process, which is killed. A handler or a thread would wait until COLMAP returns: its
     adjustments keep the interpreter's lock for up to a minute. COLMAP's own handler prints a stack trace.
     """
     ends = {signal.SIGINT, signal.SIGTERM}
@@ -60,10 +60,10 @@ def entrypoint() -> None:
     try:
         verdict = prepare(settings)
     except Exception as error:
-        says = error if isinstance(error, InputError) else used_up(error)
-        if says is None:
+        summary = error if isinstance(error, InputError) else used_up(error)
+        if summary is None:
             raise
-        log(f"mmpi-prepare: {says}", "bold red")
+        log(f"mmpi-prepare: {summary}", "bold red")
         sys.exit(1)
     sys.exit(0 if verdict.grade == "right" else 3)
 

@@ -1,6 +1,5 @@
-"""What is done to a model: bundle adjustment, with points of all matches or of known poses and the lens as far as the
-images determine it; alignment with another track of the same cameras; and the frame of the scene, by gravity and
-metres."""
+"""Bundle adjustment of a model, with points of all matches or of given poses and the lens as far as the images
+determine it; alignment with another track of the same cameras; and the frame of the scene, by gravity and metres."""
 
 from __future__ import annotations
 
@@ -18,33 +17,33 @@ from mmpi_priors.sfm import MIN_ANGLE, triangulate_points, verified_matches
 from mmpi_priors.upright import level_up
 
 STILL = 1e-6
-"""Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive
-that took four times as long, and moved the focal length by 0.002 px."""
+"""Relative change of the cost at which an adjustment ends. COLMAP's 100 iterations took four times as long on 64
+images of a drive, and changed the focal length by 0.002 px."""
 WORTH = 0.97
 """Fraction of the reprojection error to which a freed parameter must lower it."""
 SQUARE = 0.8
 """The same for pixels that are not square, as those of some old video."""
 IMAGES_OF_LENS = 3
-"""Images of a camera from which more than one term of its lens can be told."""
+"""Minimum images of a camera for more than one term of its lens."""
 LARGEST_ERROR = 4.0
 """Reprojection error in pixels above which an observation is dropped."""
 ENOUGH_POINTS = 300
-"""Points of each image, the ones that most images see, on which a choice between camera models rests."""
+"""Points of each image, those seen by the most images, for the choice between camera models."""
 PARTS = 20
 """Number of images from which the two halves of a capture are also used separately to judge the focal length."""
 WIDE = 0.08
-"""Width of the interval of the focal length, relative to it, from which --focal is asked for."""
+"""Relative width of the interval of the focal length from which --focal is requested."""
 NOTED_OFF, NOTED_WORTH, NOTED_ROUNDS = 0.1, 0.95, 3
 """Relative difference of a refined focal length from that of EXIF, which is rounded, from which it is asked whether the
 images determine it; share of the reprojection error with that of EXIF to which they must lower it; and adjustments with
 that of EXIF, as it changes all heights."""
 REFINE_ROUNDS, COARSE_PX, FINE_PX = 3, 8.0, 4.0
-"""Rounds of refining known poses and triangulating points again; largest reprojection error of a point while these are
+"""Rounds of refining given poses and triangulating points again; largest reprojection error of a point while these are
 to be refined, and in the end."""
 LEAST_SHARE = 0.2
-"""Fraction of the matched keypoints that must become points; few do where known poses are those of other images."""
+"""Fraction of the matched keypoints that must become points; few do if given poses are those of other images."""
 BENT_PX = 0.8
-"""Mean reprojection error above which another attempt is made even though the images are registered."""
+"""Mean reprojection error above which another attempt follows although the images are registered."""
 ROTATION_WEIGHT = 1.0
 """Weight of rotations in the alignment of two tracks; the main direction of the centres has weight 1."""
 LEAST_GROUND, GROUND_SHARE, TRIALS = 50, 0.15, 2000
@@ -80,7 +79,7 @@ def adjust(
 
 
 def fit_error(model: pycolmap.Reconstruction) -> float:
-    """Root mean square of the points' errors in pixels, where single points that are lost count little."""
+    """Root mean square of the points' errors in pixels, robust to single outliers."""
     errors = np.array([point.error for point in model.points3D.values()])
     lengths = np.array([point.track.length() for point in model.points3D.values()], np.float64)
     errors = np.minimum(np.nan_to_num(errors, nan=np.inf), LARGEST_ERROR)
@@ -146,14 +145,14 @@ def polish(
         adjust(light, threads, lens)
         advance()
         start = light
-        for says, kind, focal, share in trials:
+        for summary, kind, focal, share in trials:
             trial = adjusted(start, kind, focal, center or not kind)
             advance()
             before, after = fit_error(light), fit_error(trial)
             fate = "kept" if after < share * before else "not kept"
             if fate == "kept" and any(turns_back(trial.cameras[n]) for n in several if kind):
                 fate = "not kept, as the lens would turn back before the corner"
-            log(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {fate}.")
+            log(f"Lens: {before:.3f} px, {after:.3f} px with {summary}: {fate}.")
             if fate == "kept":
                 light, center, chosen = trial, center or not kind, (kind, focal) if kind else chosen
                 start = start if kind else trial
@@ -171,12 +170,13 @@ def quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
 
 
 def is_bent(model: pycolmap.Reconstruction) -> bool:
-    """Whether a model fits its images so badly that it may have started from a wrong pair: squeezed or folded."""
+    """Whether a model fits its images so badly that it may have started from a wrong pair and be squeezed or folded."""
     return not quality(model)[0]
 
 
 def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """A copy with the points that most images see, ENOUGH_POINTS for each image: as telling, and quickly adjusted."""
+    """A copy with the points seen by the most images, ENOUGH_POINTS for each image: as informative, and quickly
+    adjusted."""
     light = copy.deepcopy(model)
     counts = dict.fromkeys(light.reg_image_ids(), 0)
     tracks = {i: [e.image_id for e in p.track.elements] for i, p in light.points3D.items()}
@@ -194,8 +194,8 @@ def with_all_points(
 ) -> pycolmap.Reconstruction:
     """A placed model with the points of all verified matches, and everything adjusted to them, in several rounds.
 
-    In place of COLMAP's own last step, which takes longer, and leaves out many points of sequences with small angles:
-    of every second frame of a drive with bends half of the matches became points, with this three quarters.
+    Replaces COLMAP's last step, which takes longer and omits many points of sequences with small angles: of every
+    second frame of a drive with bends, half of the matches became points, here three quarters.
     """
     for _ in range(rounds):
         model = triangulate_points(model, database, images, threads, LARGEST_ERROR)
@@ -242,8 +242,8 @@ def open_focals(model: pycolmap.Reconstruction, database: Path, threads: int) ->
     """Focal lengths that a database of features has from EXIF, in pixels by camera, if the images hardly determine
     them, but end elsewhere: with those of EXIF the error is hardly larger. Else empty.
 
-    If all cameras look the same way and move across it, as on a level flight, everything twice as far away through a
-    lens twice as long shows the same."""
+    If all cameras look the same way and move across it, as on a level flight, doubling all distances and the focal
+    length gives the same images."""
     with pycolmap.Database.open(database) as opened:
         cameras = [c for c in opened.read_all_cameras() if c.has_prior_focal_length]
     noted = {c.camera_id: c.mean_focal_length() for c in cameras}
@@ -267,12 +267,12 @@ def keeps_focals(model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Came
     return all(i in noted and np.isclose(focal, noted[i], 1e-6) for i, focal in used.items())
 
 
-def map_known_poses(
+def map_given_poses(
     model: pycolmap.Reconstruction, database: Path, images: Path, refine_poses: bool, refine_lens: bool, threads: int
 ) -> tuple[pycolmap.Reconstruction, str]:
     """Triangulates points from the poses of a model, and refines these, aligned with the given scale and frame.
 
-    Returns the model with points, and what was done in words. Raises InputError if the poses do not fit the matches.
+    Returns the model with points, and a summary. Raises InputError if the poses do not fit the matches.
     """
     _, before = camera_poses(model)
     refines = refine_poses or refine_lens
@@ -289,7 +289,7 @@ def map_known_poses(
             "to world is wanted) or the intrinsics (--focal, --camera) are not what the poses were made with."
         )
     error = model.compute_mean_reprojection_error()
-    says = f"points from known poses: {share:.0%} of the matched keypoints, {error:.2f} px"
+    summary = f"points from known poses: {share:.0%} of the matched keypoints, {error:.2f} px"
     if refines:
         for _ in range(REFINE_ROUNDS):
             adjust(model, threads, refine_lens, poses=refine_poses)
@@ -298,12 +298,12 @@ def map_known_poses(
         _, after = camera_poses(model)
         moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=-1)
         turned = degrees_between(after[:, :3, :3], before[:, :3, :3])
-        says += (
+        summary += (
             f"; refined, {model.compute_mean_reprojection_error():.2f} px; poses moved by {moved.mean():.3g} units (at "
             f"most {moved.max():.3g}) and turned by {turned.mean():.2f} degrees (at most {turned.max():.2f})"
         )
-    log(says)
-    return model, says
+    log(summary)
+    return model, summary
 
 
 def camera_poses(model: pycolmap.Reconstruction) -> tuple[list[str], Array]:
@@ -403,7 +403,7 @@ def choose_frame(
         scale, words = camera_height / height, "normal of the ground"
         unit = f"1 metre, from a camera height of {camera_height:g} m above the ground"
     elif gps is not None:
-        scale, unit = gps.scale, f"1 metre, from {gps.says} m"
+        scale, unit = gps.scale, f"1 metre, from {gps.summary} m"
         up, words = (up, words) if gps.up is None else (gps.up, "GPS")
     else:
         extent = float(np.ptp(centers @ np.linalg.svd(centers - centers.mean(0))[2][0]))

@@ -21,10 +21,11 @@ from mmpi_prepare.images import in_short
 BLURRED, BESIDE = 0.4, 3
 """Fraction of its neighbours' sharpness below which a frame counts as blurred, and neighbours on either side."""
 JUMP, TURN = 5.0, 8.0
-"""Times its neighbours' step (or turn) from which a step counts as a jump; minimum angle of such a turn, degrees."""
+"""Multiple of its neighbours' step (or turn) from which a step counts as a jump; minimum angle of such a turn,
+degrees."""
 FOCAL_OFF, FOCAL_HELPS = (0.03, 0.05), (0.95, 0.85)
-"""Relative change of a given focal length, when refined, from which it is doubted, and the scene with it, if refining
-it lowers the reprojection error below these fractions."""
+"""Relative change of a given focal length by refinement from which it, and the scene with it, is doubtful, if
+refinement lowers the reprojection error below these fractions."""
 WORST, CELLS = 5, (8, 6)
 """Number of images with the least coverage that are listed; columns and rows of the grid for coverage."""
 
@@ -37,9 +38,9 @@ class Finding:
     """One word and a question mark: the suspected problem."""
     image: str
     """Empty for the scene as a whole."""
-    says: str
+    summary: str
     badness: float = 1.0
-    """Sorts findings of a kind."""
+    """Sort key of findings of a kind."""
     is_grave: bool = False
     """Whether it makes the scene doubtful."""
 
@@ -52,21 +53,21 @@ def by_kind(findings: Sequence[Finding]) -> list[str]:
     lines = []
     for kind, (worst, *others) in kinds.items():
         image = f"{worst.image}: " if worst.image else ""
-        rest = f"; then {in_short([f.image or f.says for f in others], 6)}" if others else ""
-        lines.append(f"{kind} {image}{worst.says}{rest}")
+        rest = f"; then {in_short([f.image or f.summary for f in others], 6)}" if others else ""
+        lines.append(f"{kind} {image}{worst.summary}{rest}")
     return lines
 
 
 def blurred(names: Sequence[str], sharp: Array) -> list[Finding]:
-    """Frames of a sequence that are much less sharp than those before and those after them: a pan may end at, and a
-    walk turn to, something that has no detail."""
+    """Frames of a sequence that are much less sharp than those before and those after them; less sharp than one side
+    alone does not count, as a pan may end at a surface without detail."""
     findings = []
     for i in range(BESIDE, len(names) - BESIDE):
         usual = min(np.median(sharp[i - BESIDE : i]), np.median(sharp[i + 1 : i + 1 + BESIDE]))
         share = float(sharp[i] / max(usual, 1e-12))
         if share < BLURRED:
-            says = f"{share:.0%} as sharp as frames before and after it: leave it out if it looks blurred"
-            findings.append(Finding("blurred?", names[i], says, -share))
+            summary = f"{share:.0%} as sharp as frames before and after it: leave it out if it looks blurred"
+            findings.append(Finding("blurred?", names[i], summary, -share))
     return findings
 
 
@@ -98,8 +99,8 @@ def doubtful_intrinsics(
     Fixed intrinsics, which were given, are refined in a copy and compared."""
     findings = []
     if focal is not None and focal[0] >= WIDE:
-        says = f"the images hardly determine the focal length ({focal[1]})"
-        findings.append(Finding("intrinsics?", "", f"{says}: give --focal if you know it"))
+        summary = f"the images hardly determine the focal length ({focal[1]})"
+        findings.append(Finding("intrinsics?", "", f"{summary}: give --focal if you know it"))
     if is_bent(model):
         error = model.compute_mean_reprojection_error()
         findings.append(Finding("bent?", "", f"a reprojection error of {error:.2f} px is high: the track may be wrong"))
@@ -115,9 +116,9 @@ def doubtful_intrinsics(
                 for off, helps in zip(FOCAL_OFF, FOCAL_HELPS, strict=True)
             )
             if is_doubtful:
-                says = f"the given focal length {fixed:.1f} px does not fit: {fitted:.1f} px would bring the error"
-                says = f"{says} from {before:.2f} to {after:.2f} px"
-                findings.append(Finding("intrinsics?", "", says, is_grave=is_grave))
+                summary = f"the given focal length {fixed:.1f} px does not fit: {fitted:.1f} px would bring the error"
+                summary = f"{summary} from {before:.2f} to {after:.2f} px"
+                findings.append(Finding("intrinsics?", "", summary, is_grave=is_grave))
     for camera in model.cameras.values():
         ratio = camera.mean_focal_length() / max(camera.width, camera.height)
         if not 0.3 < ratio < 4:
@@ -158,7 +159,7 @@ def write_report(
         "coverage": f"{np.mean(list(covered.values())):.0%} on average, {min(covered.values()):.0%} at least",
     }
     by_badness = sorted(findings, key=lambda f: (f.kind, -f.badness))
-    warnings = [*warnings, *(f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}" for f in by_badness)]
+    warnings = [*warnings, *(f"{f.kind} {f.image + ': ' if f.image else ''}{f.summary}" for f in by_badness)]
     cameras = ((c, ", ".join(f"{v:.5g}" for v in c.params)) for _, c in sorted(model.cameras.items()))
     parts = [
         f"# {title}\n\n| | |\n|---|---|",

@@ -22,8 +22,8 @@ from mmpi_prepare.poses import KIND
 
 KINDS = (".png", ".npy")
 SHAPE = 0.02
-"""Relative difference between the shapes (width over height) of an image and of its depth image, at most: sensors and
-colour cameras have other sizes, but depths must be registered to the colours."""
+"""Maximum relative difference between the shapes (width over height) of an image and of its depth image: sizes of
+sensors and colour cameras differ, but depths must be registered to the colours."""
 THOUSAND = 1000.0
 """Values of a depth image for one scene unit: nerfstudio's ``depth_unit_scale_factor`` of 0.001."""
 STAMP, LAG = re.compile(r"\d+\.\d+"), 0.02
@@ -31,8 +31,8 @@ STAMP, LAG = re.compile(r"\d+\.\d+"), 0.02
 TUM = 0.2
 """Millimetres of a value of a depth image there: a folder with depth.txt beside it."""
 LEAST, SPREAD = 100, 0.1
-"""SfM points with a depth, at least, and median difference of their depths from the model's, at most: sensors have 0.01
-to 0.03, depths of other images and disparities 0.3."""
+"""Minimum number of SfM points with a depth, and maximum median difference of their depths from the model's: 0.01 to
+0.03 for sensors, 0.3 for depths of other images and disparities."""
 
 
 def find_depths(folder: Path, photos: Sequence[Photo]) -> dict[str, Path]:
@@ -93,7 +93,7 @@ def read_millimetres(file: Path) -> NDArray[np.float32]:
 
 
 def metres_of(model: pycolmap.Reconstruction, files: Mapping[str, Path]) -> tuple[float, str]:
-    """Metres for a unit of a model by the depths at its points (the median ratio), and how well they agree, in words.
+    """Metres per unit of a model by the depths at its points (the median ratio), and their agreement in words.
 
     Raises InputError if they contradict the model.
     """

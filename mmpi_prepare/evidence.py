@@ -1,7 +1,7 @@
-"""Evidence on the correctness of a reconstruction, which a wrong track cannot fake.
+"""Evidence on the correctness of a reconstruction that a wrong track cannot satisfy.
 
 A track that breaks and continues at another scale, or folds over, has a small reprojection error: each part fits its
-own points. But matches between the parts do not fit. So the evidence is taken from the verified matches of image
+own points, but matches between the parts do not fit. So the evidence is taken from the verified matches of image
 pairs, which do not depend on any track: how many became points that both images see, and how many lie on the epipolar
 lines of the two poses, also separately for the pairs across each gap between two frames. In addition, points seen on
 both sides of a gap are triangulated twice, from either side alone: if the scale changes, the two differ. The results of
@@ -82,7 +82,7 @@ class Witness:
     """Mean focal length over the longer side."""
     scales: Array
     """Logarithm of the change of scale across each gap, reduced to its certain part; NaN if unknown. [N - 1]"""
-    says: str
+    summary: str
     """How the mapper made it, in words."""
     model: pycolmap.Reconstruction
     only_turns: bool = False
@@ -103,7 +103,9 @@ class Agreement:
     """Whether both are the same track."""
 
 
-def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
+def witness_of(
+    name: str, summary: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]
+) -> Witness:
     """The evidence on a mapper's model, which has the keypoints of the database; ``offered`` are the names of all
     images of the capture in order. Images of one frame of a rig count as the first of them.
 
@@ -155,7 +157,7 @@ def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: P
         Pairs(low, high, *table[:, 2:].T.astype(np.float64)),
         camera.mean_focal_length() / max(camera.width, camera.height),
         scale_changes(points_seen, places, centers, directions, len(names)),
-        says,
+        summary,
         model,
         turns_explain(matched, fits),
     )

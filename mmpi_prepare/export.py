@@ -32,7 +32,7 @@ class Split:
 
     train: tuple[str, ...]
     test: tuple[str, ...]
-    says: str
+    summary: str
 
 
 def split_images(
@@ -54,8 +54,8 @@ def split_images(
                 raise InputError(f"None of the {len(listed)} {key} of {source} is among the registered images.")
         return Split(sides[0], sides[1], f"as listed in {source}")
     if test_every == 0:
-        says = "every image is used for training and testing (--test-every 0): scores are meaningless"
-        return Split(tuple(names), tuple(names), says)
+        summary = "every image is used for training and testing (--test-every 0): scores are meaningless"
+        return Split(tuple(names), tuple(names), summary)
     every = train_every or test_every or min(8, len(names))
     picked = {n for i, n in enumerate(names) if i % every == every // 2}
     rest = {n for n in names if n not in picked}
@@ -63,8 +63,8 @@ def split_images(
     if not train or not test:
         raise InputError(f"One image in {every} of {len(names)} leaves nothing to train or to test: use another.")
     role = "trains, the others test" if train_every else "tests, the others train"
-    says = f"one image in {every} {role}, from the {every // 2 + 1}. on"
-    return Split(tuple(n for n in names if n in train), tuple(n for n in names if n in test), says)
+    summary = f"one image in {every} {role}, from the {every // 2 + 1}. on"
+    return Split(tuple(n for n in names if n in train), tuple(n for n in names if n in test), summary)
 
 
 def transforms(

@@ -184,9 +184,9 @@ def choose_pairs(
             matching, why = "exhaustive", f"{count} images in no order"
         else:
             matching, why = "retrieval", f"{count} images in no order are too many to match all"
-    says = f"{matching} ({why})"
+    summary = f"{matching} ({why})"
     if matching == "exhaustive":
-        return [(i, j) for i in range(count) for j in range(i + 1, count)], says
+        return [(i, j) for i in range(count) for j in range(i + 1, count)], summary
     apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     usable, number = apart > 0, LOOK_ALIKES
     if matching != "retrieval":  # pairs that may show a place again: as similar as images a few frames apart
@@ -197,7 +197,7 @@ def choose_pairs(
     order = np.argsort(-alike, axis=-1, kind="stable")[:, :number]
     some = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row if alike[i, j] > -1e9}
     if matching == "retrieval":
-        return sorted(some), says
+        return sorted(some), summary
     steps = [*range(1, overlap + 1), *(s for s in FAR_STEPS if s > overlap)]
     near = {(i, i + s) for s in steps for i in range(count - s)}
-    return sorted(near | some), f"{says}, {len(some)} pairs that may be revisits"
+    return sorted(near | some), f"{summary}, {len(some)} pairs that may be revisits"

@@ -38,7 +38,7 @@ class Fit:
     """Metres for a unit of the model."""
     up: Array | None
     """Unit vector in the model; None where GPS does not tell it. [3]"""
-    says: str
+    summary: str
     """Photos and error in words."""
 
 
@@ -131,6 +131,6 @@ def find_fit(poses: Array, places: Sequence[Place | None]) -> Fit | None:
         return None
     kept = np.count_nonzero(errors <= OFF * max(error, 1e-9))
     number = f"{kept}" if kept == len(noted) else f"{kept} of {len(noted)}"
-    says = f"GPS of {number} photos: they agree to {error:.1f} m of {extent:.0f}"
-    log(f"{what} from {says}.")
-    return Fit(scale, up, says)
+    summary = f"GPS of {number} photos: they agree to {error:.1f} m of {extent:.0f}"
+    log(f"{what} from {summary}.")
+    return Fit(scale, up, summary)

@@ -92,7 +92,7 @@ class Attempt:
     """One way to run the incremental mapper."""
 
     name: str
-    says: str
+    summary: str
     min_matches: int = 15
     min_angle: float = 1.5
     """Degrees between the rays of a point."""
@@ -132,8 +132,8 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
         result = _run(task, attempt, database, best[1] if best and carries else None)
         size = result[0].num_reg_images() if result else 0
         tried.append(f"{attempt.name} {size}")
-        says = f", {result[0].compute_mean_reprojection_error():.2f} px" if result else ""
-        log(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
+        summary = f", {result[0].compute_mean_reprojection_error():.2f} px" if result else ""
+        log(f"Mapping, {attempt.name} ({attempt.summary}): {size} of {total} images{summary}.")
         if result and (best is None or quality(result[0]) > quality(best[0])):
             best, chosen = result, attempt.name
         if result and size >= ENOUGH * total and not is_bent(result[0]):
@@ -257,10 +257,10 @@ def map_globally(
     return largest and largest[0]
 
 
-def _evidence(name: str, says: str, model: pycolmap.Reconstruction, task: Task) -> Witness | None:
+def _evidence(name: str, summary: str, model: pycolmap.Reconstruction, task: Task) -> Witness | None:
     """The evidence on one candidate model; None, with the reason said, where it has none."""
     try:
-        return witness_of(name, says, model, task.database, task.offered)
+        return witness_of(name, summary, model, task.database, task.offered)
     except (ArithmeticError, ValueError, RuntimeError) as error:  # numpy's LinAlgError is a ValueError
         log(f"Mapping, {name}: left out, its model cannot be judged ({brief(error)}).", "yellow")
         return None
@@ -282,21 +282,21 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
     noted = open_focals(model, task.database, task.threads) if task.lens else {}
     if noted:
         model, *rest = (with_focals(m, noted, task.threads) for m in (model, *(w.model for w in others)))
-        judged = (_evidence(w.name, w.says, m, task) for w, m in zip(others, rest, strict=True))
+        judged = (_evidence(w.name, w.summary, m, task) for w, m in zip(others, rest, strict=True))
         others = [witness for witness in judged if witness is not None]
         before = None
     else:
         before = chosen
         model = polish(model, task.threads, task.lens, task.full_lens, task.principal_point)
-    polished = _evidence(chosen.name, chosen.says, model, task)
+    polished = _evidence(chosen.name, chosen.summary, model, task)
     grades = [ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished) if w is not None]
     if polished is None or grades[1] > grades[0]:
         log("The final bundle adjustment makes the evidence worse: left out.", "yellow")
     else:
         chosen = polished
     verdict = judge_together(chosen, others, task.is_ordered, before)
-    beside = [f"{w.says}, {judge_alone(w, task.is_ordered).grade} by itself" for w in others]
-    return chosen.model, "; beside it ".join([chosen.says, *beside]), verdict
+    beside = [f"{w.summary}, {judge_alone(w, task.is_ordered).grade} by itself" for w in others]
+    return chosen.model, "; beside it ".join([chosen.summary, *beside]), verdict
 
 
 def _candidates(task: Task) -> list[Witness]:
@@ -318,8 +318,8 @@ def _candidates(task: Task) -> list[Witness]:
     attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
     try:
         start = _start_from(task, "from-global", focals)
-        model, says = reconstruct(task, start, attempts)
-        witness = _evidence("incremental", says, model, task)
+        model, summary = reconstruct(task, start, attempts)
+        witness = _evidence("incremental", summary, model, task)
         candidates += [witness] if witness is not None else []
     except InputError as error:
         failed = error
@@ -389,13 +389,13 @@ def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[st
             continue
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
         error = model.compute_mean_reprojection_error()
-        says = f"{model.num_reg_images()} of {len(names)} images, {error:.2f} px, focal length {focal} px"
-        witness = _evidence("global", f"{name} ({says})", model, task)
+        summary = f"{model.num_reg_images()} of {len(names)} images, {error:.2f} px, focal length {focal} px"
+        witness = _evidence("global", f"{name} ({summary})", model, task)
         if witness is None:
             continue
         if share(witness.pairs.tracked, witness.pairs.matches) < LEAST_POINTS:
-            says += "; left out, as hardly any match became a point"
+            summary += "; left out, as hardly any match became a point"
         else:
             candidates.append(witness)
-        log(f"Mapping, {name}: {says}.")
+        log(f"Mapping, {name}: {summary}.")
     return candidates

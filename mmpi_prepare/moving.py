@@ -1,4 +1,4 @@
-"""Masks of what moves in the training images of a prepared scene."""
+"""Masks of moving objects in the training images of a prepared scene."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def write_masks(
     """Finds what moves in the training images, which alone are compared; where anything does, writes a mask for each
     photo, ``target/NAME.png``, white where used and of test images, and a picture.
 
-    Returns the share that is masked of each image in which something moves, by name, and the doubt of ``find_moving``.
+    Returns the masked share of each image with moving objects, by name, and the doubt of ``find_moving``.
     """
     if threads > 0:
         torch.set_num_threads(threads)

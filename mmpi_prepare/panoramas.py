@@ -1,6 +1,6 @@
-"""Panoramas of 360-degree cameras: recognised, and cut into perspective faces, which are a rig for COLMAP.
+"""Recognition of panoramas of 360-degree cameras, and their perspective faces, which form a rig for COLMAP.
 
-Faces are those of a cube, but for the one that looks down: it shows who or what holds the camera.
+The faces are those of a cube without the one that faces down, which shows the tripod or the photographer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FACES = {
 }
 """Axes of the faces (right, down, ahead) in those of the front face: the rotation from it to each."""
 SAMPLE = 16
-"""Images looked at to find whether those that are twice as wide as high are panoramas."""
+"""Images checked for whether those that are twice as wide as high are panoramas."""
 APART = 8
 """Columns of an image that are compared with each other."""
 OTHERS = ("poses", "depths", "focal", "camera", "lens", "intrinsics", "refine_intrinsics", "undistort")
@@ -49,7 +49,7 @@ def wraps(pixels: NDArray[np.uint8]) -> bool:
 
 
 def are_panoramas(folder: Path, photos: Sequence[Photo]) -> bool:
-    """Whether images are panoramas: most of those that are twice as wide as high, to a pixel, go all round. Raises
+    """Whether images are panoramas: the edges of most images twice as wide as high, to a pixel, match. Raises
     InputError where others are among them, or they are of several sizes."""
     fitting = [p for p in photos if abs(p.width - 2 * p.height) <= 1]
     going_round = []
@@ -116,7 +116,7 @@ def check(settings: Settings) -> None:
 
 
 def join(database: Path) -> None:
-    """Makes the faces of each panorama in a database a frame of a rig, which has one pose."""
+    """Groups the faces of each panorama in a database into a frame of a rig, which has one pose."""
     cameras = []
     for face, turn in FACES.items():
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(turn, np.float64)), np.zeros(3)) if cameras else None
@@ -131,4 +131,4 @@ def split_panoramas(names: Sequence[str], test_every: int | None, train_every: i
     train, test = (
         tuple(n for n in names if f"front-{n.partition('-')[2]}" in side) for side in (fronts.train, fronts.test)
     )
-    return Split(train, test, f"of the panoramas, {fronts.says}")
+    return Split(train, test, f"of the panoramas, {fronts.summary}")

@@ -22,7 +22,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from mmpi_ns.utils.errors import FULL, InputError, log, progress, quoted
 from mmpi_ns.utils.files import whole, write_text
 from mmpi_prepare import checks, export, features, images, panoramas
-from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_known_poses
+from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_given_poses
 from mmpi_prepare.depths import find_depths, metres_of, write_depths
 from mmpi_prepare.gps import Fit, find_fit
 from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
@@ -39,17 +39,17 @@ WORDS = {"features": "features", "matches": "matching", "model": "mapping"}
 LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 LEAST_IMAGES = 3
-"""From which poses can be found; COLMAP's mappers make no smaller model."""
+"""Minimum number of images; COLMAP's mappers make no smaller model."""
 LEAST_SHARE = 0.5
 """Share of the images that must be registered, unless --allow-partial."""
 
 
 class Preparation:
-    """A run of mmpi-prepare in stages. The work folder holds what an interrupted run left, a folder for each stage.
+    """A run of mmpi-prepare in stages. The work folder has a folder for each stage, also those of an interrupted run.
 
     A stage is valid while its own settings and those of all earlier ones are unchanged, and is skipped if it was
-    finished; the first that changed is emptied, and so are all after it. An interrupted stage finds its own partial
-    output again.
+    finished; the first changed stage and all later ones are emptied. An interrupted stage continues from its own
+    partial output.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -60,14 +60,14 @@ class Preparation:
         self.key = ""
 
     def run(self) -> Verdict:
-        """Input to scene; how far it can be believed."""
+        """Runs all stages. Returns the verdict on the scene."""
         s = self.settings
         self._read()
         source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
         cameras = self.numbers, self.cameras
         how = self.image_folder, self.photos, cameras, self.masks, s.max_features, s.threads
         folder, _ = self._stage("features", source, partial(features.extract, *how))
-        poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
+        poses = {n: p.tolist() for n, p in self.given_poses.poses.items()} if self.given_poses else None
         source = [s.matching, s.overlap, poses]
         folder, self.matching = self._stage("matches", source, partial(self._match, folder / features.DATABASE))
         log(f"Matching: {self.matching}.")
@@ -86,7 +86,7 @@ class Preparation:
             )
         if verdict.grade == "broken" and not s.allow_doubtful:
             raise InputError(
-                f"The track that was found is wrong, so no scene was made. {verdict.says} {self._remedy()} "
+                f"The track that was found is wrong, so no scene was made. {verdict.summary} {self._remedy()} "
                 "To look at it all the same: --allow-doubtful."
             )
         return self._write(model, verdict)
@@ -119,7 +119,7 @@ class Preparation:
         return folder, state["result"]
 
     def _read(self) -> None:
-        """Images, masks and known poses, and their cameras with whether intrinsics are to be kept."""
+        """Images, masks and given poses; their cameras, and whether intrinsics are kept."""
         s = self.settings
         self.is_video = s.input.is_file()
         if self.is_video and s.input.suffix.lower() not in images.VIDEOS:
@@ -146,9 +146,9 @@ class Preparation:
             self.masks, self.is_video = folder / "masks" if self.masks else None, False
         self.depths = find_depths(s.depths, self.photos) if s.depths is not None else {}
         self.photos = [p for p in self.photos if not self.depths or p.name in self.depths]
-        self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
+        self.given_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
         count = self.panoramas or len(self.photos)
-        if self.known_poses is None and count < LEAST_IMAGES:
+        if self.given_poses is None and count < LEAST_IMAGES:
             raise InputError(
                 f"Poses cannot be found for {count} images alone, as no third confirms them: take more "
                 "(better twenty), or give known poses (--poses)."
@@ -159,7 +159,7 @@ class Preparation:
         for factor in s.downscales:
             if factor > min(smallest.width, smallest.height):
                 raise InputError(f"--downscales {factor} leaves no pixel of {smallest.name}: give smaller factors.")
-        lenses = self.known_poses.intrinsics if self.known_poses else {}
+        lenses = self.given_poses.intrinsics if self.given_poses else {}
         if s.camera is not None:
             numbers = (s.camera[0], *s.camera) if len(s.camera) == 3 else s.camera
             lenses = dict.fromkeys((p.name for p in self.photos), opencv_camera(numbers, s.lens == "fisheye"))
@@ -167,28 +167,28 @@ class Preparation:
             lenses = {}
         self.numbers, self.cameras = make_cameras(self.photos, s.intrinsics, lenses, s.focal, s.lens)
         is_given = bool(lenses) or s.focal is not None
-        if self.known_poses is not None and not is_given and not all(p.exif_focal for p in self.photos):
+        if self.given_poses is not None and not is_given and not all(p.exif_focal for p in self.photos):
             raise InputError("Known poses need the intrinsics they were made with: give --focal or --camera.")
-        self.is_fixed = (is_given or self.known_poses is not None) and not s.refine_intrinsics
+        self.is_fixed = (is_given or self.given_poses is not None) and not s.refine_intrinsics
 
     def _match(self, unmatched: Path, folder: Path) -> str:
-        """Makes the database with verified matches; what was matched in words."""
+        """Makes the database with verified matches. Returns a summary of the matched pairs."""
         s, database, names = self.settings, folder / features.DATABASE, [p.name for p in self.photos]
         if not database.exists():
             with whole(database) as unfinished:
                 shutil.copyfile(unmatched, unfinished)
                 if self.panoramas:
                     panoramas.join(unfinished)
-        if self.known_poses is not None and s.matching == "auto":
-            places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
-            poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
+        if self.given_poses is not None and s.matching == "auto":
+            places = [i for i, n in enumerate(names) if n in self.given_poses.poses]
+            poses = np.array([self.given_poses.poses[names[i]] for i in places])  # OpenCV axes
             # Poses that are wrong name wrong neighbours: the next images are evidence beside them.
             near = {*near_pairs(poses[:, :3], 2 * s.overlap), *((i, i + 1) for i in range(len(places) - 1))}
             pairs = sorted((places[i], places[j]) for i, j in near)
-            says = f"the {2 * s.overlap} nearest by pose, and the next"
+            summary = f"the {2 * s.overlap} nearest by pose, and the next"
         else:
             alike = features.image_similarity(database, len(names))
-            pairs, says = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
+            pairs, summary = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
         if self.panoramas:  # faces of one panorama have nothing in common
             pairs = [(i, j) for i, j in pairs if (j - i) % self.panoramas]
         with progress("Matching pairs", len(pairs)) as advance:
@@ -196,15 +196,15 @@ class Preparation:
                 batch = [(names[i], names[j]) for i, j in pairs[start : start + features.PAIR_BATCH]]
                 match_pairs(database, batch, threads=s.threads)
                 advance(len(batch))
-        return f"{says}; {len(features.matching_pairs(database))} of {len(pairs)} pairs match"
+        return f"{summary}; {len(features.matching_pairs(database))} of {len(pairs)} pairs match"
 
     def _map(self, database: Path, folder: Path) -> dict[str, Any]:
-        """Makes the model; how, the verdict, the interval of a refined focal length, and groups of at least
-        three images without a pose that verified matches connect, the largest first."""
+        """Makes the model. Returns a summary, the verdict, the interval of a refined focal length, and groups of at
+        least three images without a pose that verified matches connect, the largest first."""
         s, names = self.settings, [p.name for p in self.photos]
         verdict, groups, focal = Verdict("right"), [], None
-        if self.known_poses is not None:
-            known = self.known_poses
+        if self.given_poses is not None:
+            known = self.given_poses
             for is_last in (s.poses_axes != "auto", True):
                 poses = {n: rigid3d(p) for n, p in known.poses.items()}
                 model = new_model(self.cameras, names, self.numbers, poses)
@@ -212,12 +212,12 @@ class Preparation:
                     break
                 known = agreeing(known, model, database)
             refine = not self.is_fixed and s.refine_intrinsics
-            model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
-            says = f"{known.says}; {says}"
+            model, summary = map_given_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
+            summary = f"{known.summary}; {summary}"
         else:
             lens, is_sequence = not self.is_fixed, self.matching.startswith("sequential")
             free = lens, lens and s.lens == "auto", s.camera is None or s.refine_intrinsics
-            model, says, verdict = map_and_judge(
+            model, summary, verdict = map_and_judge(
                 Task(database, self.image_folder, folder, names, *free, s.threads, is_sequence, self.is_ordered)
             )
             lost = sorted(set(range(1, len(names) + 1)) - set(model.reg_image_ids()))
@@ -233,21 +233,21 @@ class Preparation:
             with progress("Checking the focal length", 1) as advance:
                 focal = focal_interval(model, s.threads)
                 advance()
-        return {"says": says, "verdict": asdict(verdict), "focal": focal, "groups": groups}
+        return {"summary": summary, "verdict": asdict(verdict), "focal": focal, "groups": groups}
 
     def _write(self, model: pycolmap.Reconstruction, verdict: Verdict) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
-        s, says = self.settings, self.mapped["says"]
+        s, summary = self.settings, self.mapped["summary"]
         focal = self.mapped["focal"][1] if self.mapped["focal"] else "given"
         if self.mapped["focal"] and keeps_focals(model, self.cameras):
             focal = f"that of EXIF kept; by the images alone {focal}"
         up = unit = "that of the given poses"
-        metres, told = metres_of(model, self.depths) if self.depths else (1.0, "not given")
+        metres, scale_note = metres_of(model, self.depths) if self.depths else (1.0, "not given")
         scale = 1.0
-        if self.known_poses is None or s.camera_height is not None:
+        if self.given_poses is None or s.camera_height is not None:
             names, poses = camera_poses(model)
             places = {p.name: p.place for p in self.photos}
-            fit = Fit(metres, None, told) if self.depths else None
+            fit = Fit(metres, None, scale_note) if self.depths else None
             if s.camera_height is None and not self.depths:
                 fit = find_fit(poses, [places[n] for n in names])
             similarity, up, unit = choose_frame(model, s.camera_height, fit)
@@ -260,8 +260,8 @@ class Preparation:
         shutil.rmtree(flat, ignore_errors=True)
         shutil.rmtree(built, ignore_errors=True)
         findings, masks, moves = self._check(model, photos, split, built)
-        grave = [f"{f.says[:1].upper()}{f.says[1:]}." for f in findings if f.is_grave]
-        if grave and self.known_poses is None and verdict.grade == "right":
+        grave = [f"{f.summary[:1].upper()}{f.summary[1:]}." for f in findings if f.is_grave]
+        if grave and self.given_poses is None and verdict.grade == "right":
             verdict = Verdict("doubtful", " ".join(grave))
         if s.undistort:
             model, photos = export.undistort(model, photos, folder, masks, flat, s.threads)
@@ -269,8 +269,8 @@ class Preparation:
         export.write_images(folder, masks, photos, built, s.downscales)
         depths = write_depths(self.depths, photos, scale / metres, built, s.downscales) if self.depths else {}
         if depths:
-            log(f"Depths: {told}; a metre is {scale / metres:.4g} units of the scene.")
-        notes = {"unit": unit, "up": up, "mapping": says, "matching": self.matching}
+            log(f"Depths: {scale_note}; a metre is {scale / metres:.4g} units of the scene.")
+        notes = {"unit": unit, "up": up, "mapping": summary, "matching": self.matching}
         (built / "colmap/sparse/0").mkdir(parents=True)
         model.write(built / "colmap/sparse/0")
         model.export_PLY(built / "sparse_pc.ply")
@@ -279,15 +279,15 @@ class Preparation:
         rows = {
             "images registered": f"{len(photos)} of {len(self.photos)}",
             "matching": self.matching,
-            "mapping": says,
-            "verdict": f"{verdict.grade} {verdict.says}".strip(),
+            "mapping": summary,
+            "verdict": f"{verdict.grade} {verdict.summary}".strip(),
             "focal length": focal,
             "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
             "what moves": moves,
-            "depths": told,
+            "depths": scale_note,
             "up": up,
             "unit": unit,
-            "split": f"{len(split.train)} train, {len(split.test)} test: {split.says}",
+            "split": f"{len(split.train)} train, {len(split.test)} test: {split.summary}",
             "times": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.times.items()),
         }
         intrinsics = "given and kept" if self.is_fixed else "refined"
@@ -306,15 +306,16 @@ class Preparation:
         s = self.settings
         if s.split_from is not None:
             return export.split_images(names, lists=read_lists(s.split_from), source=s.split_from.name)
-        if self.known_poses is not None and self.known_poses.split and s.test_every is None and s.train_every is None:
-            return export.split_images(names, lists=self.known_poses.split, source=f"{s.poses}")
+        if self.given_poses is not None and self.given_poses.split and s.test_every is None and s.train_every is None:
+            return export.split_images(names, lists=self.given_poses.split, source=f"{s.poses}")
         split = panoramas.split_panoramas if self.panoramas else export.split_images
         return split(names, s.test_every, s.train_every)
 
     def _check(
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split, built: Path
     ) -> tuple[list[checks.Finding], Path | None, str]:
-        """Findings on the scene to be built; the folder of its masks, given or of what moves; what moves in words."""
+        """Findings on the scene to be built; the folder of its masks, given or of moving objects; a summary of
+        these."""
         s, names, sharp = self.settings, [p.name for p in photos], np.zeros(len(photos))
         focal = None if keeps_focals(model, self.cameras) else self.mapped["focal"]
         findings = checks.doubtful_intrinsics(model, self.is_fixed, focal, s.threads)
@@ -340,12 +341,16 @@ class Preparation:
         if not moves:
             return findings, None, "not known" if doubt else "nothing is seen to move"
         moving, fate = sum(moves.values()) / len(split.train), "are masked" if s.moving == "mask" else "move"
-        says = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
-        log(f"What moves: {says}; report/moving.jpg shows them.")
+        summary = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
+        log(f"What moves: {summary}; report/moving.jpg shows them.")
         if s.moving == "mask":
-            return findings, target, says
+            return findings, target, summary
         words = "of the image moves: mask it (--moving mask, or --masks)"
-        return [*findings, *(checks.Finding("moving?", n, f"{x:.0%} {words}", x) for n, x in moves.items())], None, says
+        return (
+            [*findings, *(checks.Finding("moving?", n, f"{x:.0%} {words}", x) for n, x in moves.items())],
+            None,
+            summary,
+        )
 
     def _publish(
         self, warnings: Sequence[str], model: pycolmap.Reconstruction, verdict: Verdict, split: export.Split
@@ -362,7 +367,7 @@ class Preparation:
             log(line, "yellow")
         is_right = verdict.grade == "right"
         if not is_right:
-            log(f"This scene is {verdict.grade}: {verdict.says} {self._remedy()}", "bold red")
+            log(f"This scene is {verdict.grade}: {verdict.summary} {self._remedy()}", "bold red")
         log(
             f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
             f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
@@ -385,19 +390,21 @@ def only_one(work: Path) -> Iterator[None]:
     except (OSError, RuntimeError, ValueError) as error:
         free = shutil.disk_usage(next(p for p in work.parents if p.is_dir())).free
         if getattr(error, "errno", None) in FULL or free < LEFT:
-            says = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
-            raise InputError(says) from error
+            summary = (
+                f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
+            )
+            raise InputError(summary) from error
         if isinstance(error, OSError):
-            says = f"{error.filename or work} cannot be read or written ({error.strerror or error}): check the path."
-            raise InputError(says) from error
+            summary = f"{error.filename or work} cannot be read or written ({error.strerror or error}): check the path."
+            raise InputError(summary) from error
         raise
 
 
 def prepare(s: Settings) -> Verdict:
-    """Makes the scene; returns how far it can be believed.
+    """Makes the scene. Returns the verdict on it.
 
     Before any work it raises InputError if an option is out of range, contradicts another or names no file, the input
-    is missing, or something would be lost in the scene's folder; later, if the input cannot be made into a scene.
+    is missing, or files in the scene's folder would be lost; later, if the input cannot be made into a scene.
     """
     load_pycolmap()  # in a version that is new enough
     check(s)

@@ -1,4 +1,4 @@
-"""The cameras that SfM starts from, and known poses: KITTI, TUM, transforms.json, 4x4 text files, matched with the
+"""Initial cameras of SfM, and given poses: KITTI, TUM, transforms.json, 4x4 text files, matched with the
 images."""
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Lens = Literal["auto", "pinhole", "radial", "opencv", "fisheye"]
 Sharing = Literal["auto", "shared", "per-image"]
 MODELS = {"pinhole": "PINHOLE", "radial": "SIMPLE_RADIAL", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 GUESSED_FOCAL = 1.2
-"""Focal length over the longer side if nothing is known: COLMAP's guess."""
+"""Focal length over the longer side without other information: COLMAP's guess."""
 GIVEN_COUNTS = {3: "f cx cy", 4: "fx fy cx cy", 8: "fx fy cx cy k1 k2 p1 p2"}
 MAX_LAG = 0.05
 """Maximum time in seconds between an image and its pose."""
@@ -44,7 +44,7 @@ def make_cameras(
     photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, pycolmap.Camera], focal: float | None, lens: Lens
 ) -> tuple[list[int], list[pycolmap.Camera]]:
     """Cameras from given intrinsics (``lenses`` by image name, ``focal`` in pixels), else from EXIF, else guessed;
-    images of one size, lens and known intrinsics share one, unless ``sharing`` says otherwise.
+    images of one size, lens and given intrinsics share one, unless ``sharing`` is set otherwise.
 
     Returns the camera of each image, numbered from 1, and the cameras in this order. Raises InputError if images of
     different sizes are to share one.
@@ -87,24 +87,24 @@ def opencv_intrinsics(camera: pycolmap.Camera) -> tuple[list[float], bool]:
 
 
 @dataclass(frozen=True)
-class KnownPoses:
+class GivenPoses:
     """Poses by image name."""
 
     poses: dict[str, Array]
     """Camera to world, OpenCV axes (x right, y down, z forward). [4, 4]"""
-    says: str
+    summary: str
     """Format and how images were matched, in words."""
     intrinsics: dict[str, pycolmap.Camera] = field(default_factory=dict)
-    """Of the same images, from a transforms.json."""
+    """Intrinsics of the same images, from a transforms.json."""
     split: dict[str, Any] | None = None
     """A transforms.json's lists of files."""
     axes: Array = field(default_factory=lambda: np.eye(3))
     """The axes that the file's matrices are taken to have, as in ``conventions.py``."""
 
 
-def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
-    """Reads known poses, a file or a folder of 4x4 text files, and matches them with the images. Raises InputError if
-    they are not understood, or fit fewer than two images."""
+def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> GivenPoses:
+    """Reads given poses, a file or a folder of 4x4 text files, and matches them with the images. Raises InputError if
+    they cannot be read, or fit fewer than two images."""
     is_transforms = path.suffix.lower() == ".json"
     if is_transforms or not path.is_dir():
         read = (_read_transforms if is_transforms else _read_lines)(path, photos)
@@ -113,11 +113,11 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
         files.sort(key=lambda p: natural_key(p.name))
         by_stem = {KIND.sub("", p.stem): p for p in files if p.is_file()}
         chosen = {p.name: by_stem[stem] for p in photos if (stem := KIND.sub("", Path(p.source).stem)) in by_stem}
-        says = "4x4 matrices, by name"
+        summary = "4x4 matrices, by name"
         if len(chosen) < 2:
             if len(files) != len(photos):
                 raise InputError(f"{path} has {len(files)} files for {len(photos)} images, and the names do not match.")
-            chosen, says = {p.name: f for p, f in zip(photos, files, strict=True)}, "4x4 matrices, in order"
+            chosen, summary = {p.name: f for p, f in zip(photos, files, strict=True)}, "4x4 matrices, in order"
         _check_apart(chosen, path)
         poses = {}
         for name, file in chosen.items():
@@ -125,7 +125,7 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
             if matrix.shape not in ((4, 4), (3, 4)):
                 raise InputError(f"{file} is {matrix.shape}, not 4x4.")
             poses[name] = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
-        read = KnownPoses(poses, says)
+        read = GivenPoses(poses, summary)
     opengl = axes == "opengl" or (axes == "auto" and is_transforms)
     flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
     poses = {n: p @ flip for n, p in read.poses.items() if np.isfinite(p).all()}
@@ -144,11 +144,11 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
         for pose in poses.values():
             pose[:3, 3] -= origin
         place = ", ".join(f"{x:.10g}" for x in origin)
-        read = replace(read, says=f"{read.says}, in map coordinates, of which ({place}) is subtracted")
+        read = replace(read, summary=f"{read.summary}, in map coordinates, of which ({place}) is subtracted")
     return replace(read, poses=poses, axes=flip[:3, :3])
 
 
-def agreeing(known: KnownPoses, model: pycolmap.Reconstruction, database: Path) -> KnownPoses:
+def agreeing(known: GivenPoses, model: pycolmap.Reconstruction, database: Path) -> GivenPoses:
     """The poses, read in the convention that explains the verified matches of a database, if theirs does not.
 
     ``model`` has the poses and cameras. Raises InputError if these contradict the matches for another reason."""
@@ -162,13 +162,15 @@ def agreeing(known: KnownPoses, model: pycolmap.Reconstruction, database: Path) 
     as_given, better, is_wrong = find_convention(matrices, known.axes, lens, Matches.of(model, database))
     if better is None:
         return known
-    says = in_words(better, known.axes, float(focals[0, 0]), float(widths.mean()), as_given.error)
+    summary = in_words(better, known.axes, float(focals[0, 0]), float(widths.mean()), as_given.error)
     if better.focal != 1.0 or better.bend is not None:
         if is_wrong:
-            raise InputError(f"The intrinsics contradict the images. {says} Give --focal or --camera.")
+            raise InputError(f"The intrinsics contradict the images. {summary} Give --focal or --camera.")
         return known
-    log(says, "yellow")
-    return replace(known, poses=dict(zip(names, better.applied(matrices), strict=True)), says=f"{known.says}. {says}")
+    log(summary, "yellow")
+    return replace(
+        known, poses=dict(zip(names, better.applied(matrices), strict=True)), summary=f"{known.summary}. {summary}"
+    )
 
 
 def _read_numbers(file: Path) -> Array:
@@ -182,7 +184,7 @@ def _read_numbers(file: Path) -> Array:
         raise InputError(f"{file} cannot be read ({error}).") from error
 
 
-def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+def _read_lines(path: Path, photos: Sequence[Photo]) -> GivenPoses:
     """Poses in the lines of a text file, in which # begins a comment.
 
     KITTI: 12 numbers, a line for each image; of more lines, the numbers in the file names choose (counted from 0). TUM:
@@ -194,7 +196,7 @@ def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
         raise InputError(f"--poses {path} is not understood: {formats}.")
     poses = np.tile(np.eye(4), (rows, 1, 1))
-    places, says = list(range(len(photos))), "one line for each image"
+    places, summary = list(range(len(photos))), "one line for each image"
     if width == 12:
         poses[:, :3] = numbers.reshape(-1, 3, 4)
         if rows != len(photos):
@@ -202,8 +204,8 @@ def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
             places = [int(d[-1]) for d in digits if d]
             if rows < len(photos) or len(set(places)) < len(photos) or max(places) >= rows:
                 raise InputError(f"{path} has {rows} poses for {len(photos)} images: they cannot be matched.")
-            says = "the lines that the images' numbers name (from 0)"
-        return KnownPoses({p.name: poses[i] for p, i in zip(photos, places, strict=True)}, f"KITTI poses, {says}")
+            summary = "the lines that the images' numbers name (from 0)"
+        return GivenPoses({p.name: poses[i] for p, i in zip(photos, places, strict=True)}, f"KITTI poses, {summary}")
     for pose, row in zip(poses, numbers, strict=True):
         pose[:3, :3] = pycolmap.Rotation3d(row[4:8]).matrix() if np.linalg.norm(row[4:8]) > 0 else np.nan
         pose[:3, 3] = row[1:4]
@@ -215,15 +217,15 @@ def _read_lines(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         if lags.min() <= MAX_LAG:
             matched[photo.name] = poses[lags.argmin()]
     if 2 * len(matched) >= len(photos):
-        return KnownPoses(matched, f"TUM poses, matched by time stamp within {MAX_LAG} s")
+        return GivenPoses(matched, f"TUM poses, matched by time stamp within {MAX_LAG} s")
     if rows != len(photos):
         raise InputError(
             f"{path} has {rows} poses for {len(photos)} images, and the images' names are not their time stamps."
         )
-    return KnownPoses({p.name: pose for p, pose in zip(photos, poses, strict=True)}, f"TUM poses, {says}")
+    return GivenPoses({p.name: pose for p, pose in zip(photos, poses, strict=True)}, f"TUM poses, {summary}")
 
 
-def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+def _read_transforms(path: Path, photos: Sequence[Photo]) -> GivenPoses:
     """Poses of a transforms.json by file name, with its intrinsics and its lists of train and test files, if any."""
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
@@ -256,7 +258,7 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
     split = meta if "train_filenames" in meta and "test_filenames" in meta else None
-    return KnownPoses(poses, "poses of a transforms.json, by name", intrinsics, split)
+    return GivenPoses(poses, "poses of a transforms.json, by name", intrinsics, split)
 
 
 def _check_apart(poses: dict[str, Any], path: Path) -> None:

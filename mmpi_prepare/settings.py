@@ -17,7 +17,7 @@ from mmpi_prepare.poses import GIVEN_COUNTS, Lens, Sharing
 
 @dataclass(frozen=True)
 class Settings:
-    """Makes a scene for ns-train from a folder of images or a video, by structure from motion or from known poses.
+    """Makes a scene for ns-train from a folder of images or a video, by structure from motion or from given poses.
 
     An interrupted run continues when it is started again with the same options.
     """
@@ -27,20 +27,20 @@ class Settings:
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder for the scene."""
     masks: Path | None = None
-    """Folder of masks named like the images; black is left out, in SfM and in training."""
+    """Folder of masks named like the images; black pixels are excluded from SfM and training."""
     moving: Literal["mask", "warn", "keep"] = "mask"
-    """What to do about what moves in the training images, unless --masks are given: mask it in training, warn, or
+    """Treatment of moving objects in the training images, unless --masks are given: mask them in training, warn, or
     neither."""
     depths: Path | None = None
     """Folder of depth images of an RGB-D camera, one for each image, named alike (or by time, as TUM's) and registered
     to it: 16-bit PNG in millimetres, or .npy in metres. They give the scale, unless --poses or --camera-height do."""
     poses: Path | None = None
-    """Known poses: a KITTI or TUM file, a transforms.json, or a folder of 4x4 text files."""
+    """Given poses: a KITTI or TUM file, a transforms.json, or a folder of 4x4 text files."""
     poses_axes: Literal["auto", "opencv", "opengl"] = "auto"
     """Camera axes of --poses (camera to world). auto: opengl for transforms.json and opencv for the others, or what the
     matches show."""
     refine_poses: bool = False
-    """Refine known poses by bundle adjustment; frame and scale are kept."""
+    """Refine given poses by bundle adjustment; frame and scale are kept."""
     focal: float | None = None
     """Focal length in pixels of the input images; kept fixed unless --refine-intrinsics."""
     camera: tuple[float, ...] | None = None
@@ -116,8 +116,8 @@ def check(s: Settings) -> None:
         f"There is no {looked_at(s.input)}: check the path.": not s.input.exists(),
         f"{s.scene} is a file: name a folder for the scene.": s.scene.is_file(),
     }
-    for says in (says for says, is_wrong in faults.items() if is_wrong):
-        raise InputError(says)
+    for summary in (summary for summary, is_wrong in faults.items() if is_wrong):
+        raise InputError(summary)
     if s.split_from is not None:
         read_lists(s.split_from)
 

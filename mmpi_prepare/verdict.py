@@ -20,12 +20,12 @@ TRACKED, BRIDGED, BRIDGED_OF_USUAL = (0.55, 0.3), (0.5, 0.25), (0.6, 0.35)
 the latter as a share of what others have. Like all pairs here: doubtful below the first, broken below the second."""
 FITTING, FITTING_ACROSS = (0.9, 0.5), (0.83, 0.5)
 """Share of the matches on or close beside their epipolar lines that must lie on them, of all and across each gap: where
-many are beside, the track is bent. (Matches far off are false, or belong to what moves.)"""
+many are beside, the track is bent. (Matches far off are false, or belong to moving objects.)"""
 HELD_ACROSS, HELD_BY_SIDE = (0.5, 0.25), (0.4, 0.15)
 """Share of all matches that must lie on their epipolar lines: of those across each gap, as false matches are fewer, and
 of an image's matches with earlier, or with later, images."""
 EDGE = 3
-"""Number of images at either end of the track where a break means little."""
+"""Number of images at either end of the track where a break is insignificant."""
 SCALE = (0.03, 0.2)
 """Logarithm of a change of scale across a gap from which it is doubtful, and broken. (Sound tracks have 0.01.)"""
 LOOSE = 0.25
@@ -33,7 +33,7 @@ LOOSE = 0.25
 JUMP = 5.0
 """Step length, in usual steps, that counts as a jump: doubtful if few of the matches across it hold."""
 CHANGE = 2.5
-"""Ratio of speeds that counts as a sudden change, treated alike."""
+"""Ratio of speeds that counts as a sudden change; doubtful likewise."""
 WEAK = 0.8
 """Share of the usual below which matches hold badly beside a jump."""
 NEARLY_ALL = 0.9
@@ -49,12 +49,12 @@ class Verdict:
     """The verdict on a model."""
 
     grade: Grade
-    says: str = ""
-    """Why, in sentences, the most severe first; empty if it is right."""
+    summary: str = ""
+    """Reasons in sentences, the most severe first; empty if it is right."""
 
 
 def remedy(cameras: int, is_sequence: bool, is_given: bool) -> str:
-    """What may help a capture of so many cameras, whose intrinsics may be given already."""
+    """Remedies for a capture of so many cameras, with or without given intrinsics."""
     ways = ["give --focal (and --lens) if you know them"] if cameras == 1 and not is_given else []
     ways += ["try --lens radial, as each lens is known from few images"] if cameras > 1 and not is_given else []
     ways += ["mask what moves (--masks)"]
@@ -85,11 +85,11 @@ def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
         grade: Grade = "broken" if len(loose) > 0.1 * count else "doubtful" if loose else "right"
         problems.append((grade, f"Most matches of {in_short(loose)} contradict their poses."))
     severe = sorted((p for p in problems if p[0] != "right"), key=lambda p: -ORDER.index(p[0]))
-    return Verdict(severe[0][0], " ".join(says for _, says in severe)) if severe else Verdict("right")
+    return Verdict(severe[0][0], " ".join(summary for _, summary in severe)) if severe else Verdict("right")
 
 
 def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
-    """Where the track of a sequence breaks, bends and leaps; nothing where few matches join its images."""
+    """Breaks, bends and jumps in the track of a sequence; none where few matches join its images."""
     pairs, count = witness.pairs, len(witness.images)
     across = bridges(pairs, count, pairs.tracked)
     if np.isnan(across).all():
@@ -102,8 +102,8 @@ def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
         at_an_end = min(gap + 1, len(across) - gap) < EDGE  # a few images may have few points and still be right
         grades.append("doubtful" if at_an_end and grade == "broken" else grade)
     at = max(range(len(across)), key=lambda gap: (ORDER.index(grades[gap]), -np.nan_to_num(across[gap], nan=1.0)))
-    says = f"{across[at]:.0%} of the matches across became points, {usual:.0%} elsewhere."
-    problems: list[tuple[Grade, str]] = [(grades[at], f"The track breaks {between[at]}: {says}")]
+    summary = f"{across[at]:.0%} of the matches across became points, {usual:.0%} elsewhere."
+    problems: list[tuple[Grade, str]] = [(grades[at], f"The track breaks {between[at]}: {summary}")]
     # The worst gaps by matches beside, and far from, the epipolar lines of the poses, and the worst image.
     for word, limits, whole in (
         ("bent", FITTING_ACROSS, pairs.fitting + pairs.beside),
@@ -112,14 +112,14 @@ def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
         fitting = bridges(pairs, count, pairs.fitting, whole)
         if np.isfinite(fitting).any():
             at = int(np.nanargmin(fitting))
-            says = f"{fitting[at]:.0%} of the matches across fit its poses."
-            problems.append((worse(float(fitting[at]), limits), f"The track is {word} {between[at]}: {says}"))
+            summary = f"{fitting[at]:.0%} of the matches across fit its poses."
+            problems.append((worse(float(fitting[at]), limits), f"The track is {word} {between[at]}: {summary}"))
     held = held_by_side(pairs, count)
     if np.isfinite(held).any():
         side, at = divmod(int(np.nanargmin(held)), count)
         others, fitting = ("later" if side else "earlier"), float(held[side, at])
-        says = f"{witness.images[at]} is misplaced: {fitting:.0%} of its matches with {others} images fit its pose."
-        problems.append((worse(fitting, HELD_BY_SIDE), says))
+        summary = f"{witness.images[at]} is misplaced: {fitting:.0%} of its matches with {others} images fit its pose."
+        problems.append((worse(fitting, HELD_BY_SIDE), summary))
     # The largest change of scale, and jumps and changes of speed where few matches hold across a gap.
     if np.isfinite(witness.scales).any():
         at = int(np.nanargmax(np.abs(witness.scales)))
@@ -131,14 +131,16 @@ def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
     leaps = np.where(is_weak, jumps, 0.0)
     if leaps.max(initial=0.0) > JUMP:
         at = int(leaps.argmax())
-        says = f"{between[at]}, {leaps[at]:.0f} usual steps, and few matches across it hold."
-        problems.append(("broken", f"The track jumps {says}"))
+        summary = f"{between[at]}, {leaps[at]:.0f} usual steps, and few matches across it hold."
+        problems.append(("broken", f"The track jumps {summary}"))
     beside_weak = np.append(is_weak, False) | np.append(False, is_weak)
     changes = np.where(beside_weak, changes, 1.0)
     if changes.max(initial=1.0) > CHANGE:
         at = int(changes.argmax())
-        says = f"{changes[at]:.1f} times at {witness.images[at]}"
-        problems.append(("doubtful", f"The speed changes {says}, where few matches hold: the scale may break there."))
+        summary = f"{changes[at]:.1f} times at {witness.images[at]}"
+        problems.append(
+            ("doubtful", f"The speed changes {summary}, where few matches hold: the scale may break there.")
+        )
     return problems
 
 
@@ -146,7 +148,7 @@ def judge_together(
     chosen: Witness, others: Sequence[Witness], is_sequence: bool, before: Witness | None = None
 ) -> Verdict:
     """The verdict on the chosen model, given those of the other mapper and from other focal lengths; ``before`` is the
-    chosen one without what was done to it alone, so that like is compared with like.
+    chosen one before its own refinement, so that equals are compared.
 
     A different track makes it doubtful unless that one can be dismissed: by its own evidence, or because a third track
     agrees with the chosen one, which fits more matches. If two mappers found the same track independently, doubtful
@@ -154,7 +156,7 @@ def judge_together(
     """
     alone = judge_alone(chosen, is_sequence)
     if chosen.only_turns and alone.grade != "broken":
-        return Verdict("doubtful", f"{TURNS} {alone.says}".strip())
+        return Verdict("doubtful", f"{TURNS} {alone.summary}".strip())
     compared = []
     for other in others:
         differences = [d for w in (before or chosen, chosen) if (d := agreement(w, other)) is not None]
@@ -174,13 +176,13 @@ def judge_together(
         return alone if alone.grade == "broken" or not is_confirmed else Verdict("right")
     other, difference = against[0]
     worst = [difference.images[int(i)] for i in np.argsort(-difference.centers)[:3]]
-    says = (
+    summary = (
         f"The {chosen.name} and the {other.name} mapper differ by {difference.centers.mean():.1%} of the track "
         f"({difference.centers.max():.1%} at most; most at {', '.join(worst)}) and by {difference.turns.mean():.1f} "
         f"degrees ({difference.turns.max():.1f} at most), with focal lengths of {chosen.focal:.2f} and "
         f"{other.focal:.2f} image sides."
     )
-    return Verdict("doubtful", f"{alone.says} {says}".strip())
+    return Verdict("doubtful", f"{alone.summary} {summary}".strip())
 
 
 def _fit(witness: Witness) -> float:

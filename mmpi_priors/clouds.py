@@ -69,8 +69,8 @@ def read_ply(path: Path) -> Array | None:
         if not len(xyz):
             raise ValueError("it holds none")
     except (PlyParseError, KeyError, ValueError, TypeError, OSError, MemoryError) as error:
-        says = f"{path} is not a PLY file of points ({error}): write it again."
-        log_once(f"[bold yellow]{says} Training goes on without the point cloud.")
+        message = f"{path} is not a PLY file of points ({error}): write it again."
+        log_once(f"[bold yellow]{message} Training goes on without the point cloud.")
         return None
     return xyz
 

@@ -286,7 +286,7 @@ class _Problem:
         return next(f for f in fits if f.error <= ALIKE * least)
 
 
-def in_words(found: Convention, given: Array, focal: float, as_pixels: float, was: float) -> str:
+def in_words(chosen: Convention, given: Array, focal: float, as_pixels: float, was: float) -> str:
     """Description of a convention for the user.
 
     Args:
@@ -295,27 +295,29 @@ def in_words(found: Convention, given: Array, focal: float, as_pixels: float, wa
         as_pixels: pixels of the width.
         was: error as given, over the width.
     """
-    says = []
-    if not np.array_equal(found.axes, given):
-        rows = [(int(np.abs(row).argmax()), row.sum() < 0) for row in found.axes]
+    faults = []
+    if not np.array_equal(chosen.axes, given):
+        rows = [(int(np.abs(row).argmax()), row.sum() < 0) for row in chosen.axes]
         words = ", ".join(f"{n} {DIRECTIONS[k][negative]}" for n, (k, negative) in zip("xyz", rows, strict=True))
-        name = next((f"{n} " for n, axes in PROGRAMS if np.array_equal(axes, found.axes)), "")
-        says.append(f"have {name}camera axes ({words})")
-    if found.inverted:
-        says.append("are world to camera, not camera to world")
-    if found.mirrored:
-        says.append("are those of a left-handed world")
-    says = [f"the matrices {' and '.join(says)}"] if says else []
-    if found.focal != 1.0:
-        center = ", and the principal point in proportion" if found.moves_center else ""
-        says.append(f"the focal length is {found.focal * focal:.0f} px, not {focal:.0f} px{center}")
-    if found.bend is not None:
+        name = next((f"{n} " for n, axes in PROGRAMS if np.array_equal(axes, chosen.axes)), "")
+        faults.append(f"have {name}camera axes ({words})")
+    if chosen.inverted:
+        faults.append("are world to camera, not camera to world")
+    if chosen.mirrored:
+        faults.append("are those of a left-handed world")
+    faults = [f"the matrices {' and '.join(faults)}"] if faults else []
+    if chosen.focal != 1.0:
+        center = ", and the principal point in proportion" if chosen.moves_center else ""
+        faults.append(f"the focal length is {chosen.focal * focal:.0f} px, not {focal:.0f} px{center}")
+    if chosen.bend is not None:
         terms = (
-            f"about {-found.bend[0]:.2g} and {-found.bend[1]:.2g} for k1 and k2" if any(found.bend) else "none at all"
+            f"about {-chosen.bend[0]:.2g} and {-chosen.bend[1]:.2g} for k1 and k2"
+            if any(chosen.bend)
+            else "none at all"
         )
-        says.append(f"the lens distortion is wrong or left out ({terms} would fit)")
-    text = "; ".join(says)
+        faults.append(f"the lens distortion is wrong or left out ({terms} would fit)")
+    text = "; ".join(faults)
     return (
-        f"{text[0].upper()}{text[1:]}: then matches agree to {found.error * as_pixels:.2f} pixels, as given they are "
+        f"{text[0].upper()}{text[1:]}: then matches agree to {chosen.error * as_pixels:.2f} pixels, as given they are "
         f"off by {was * as_pixels:.1f}."
     )

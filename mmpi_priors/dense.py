@@ -202,19 +202,19 @@ def _tasks(
         [i, *nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, among)] for i in range(len(images.files))
     ]
     last_uses = {j: i for i, views in enumerate(near) for j in views}
-    shown: dict[int, Future[View]] = {}
+    views_of: dict[int, Future[View]] = {}
     depths: dict[int, Future[Depth]] = {}
     first = 0
     for i, views in enumerate(near):
         for j in views:
-            if j not in shown:
-                shown[j] = pool.submit(load_view, images, j, side)
-        depths[i] = pool.submit(match, i, [shown[j] for j in views])
+            if j not in views_of:
+                views_of[j] = pool.submit(load_view, images, j, side)
+        depths[i] = pool.submit(match, i, [views_of[j] for j in views])
         yield False, depths[i]
         while first < len(near) and max(near[first]) <= i:
-            yield True, pool.submit(confirm, first, [(shown[j], depths[j]) for j in near[first]])
+            yield True, pool.submit(confirm, first, [(views_of[j], depths[j]) for j in near[first]])
             for j in [j for j, last in last_uses.items() if last == first]:
-                del shown[j], depths[j]
+                del views_of[j], depths[j]
             first += 1
 
 

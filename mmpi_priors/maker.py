@@ -101,8 +101,8 @@ class CapturePriors(PriorsMaker):
         if posed is None:
             return None, "a camera is neither perspective nor fisheye"
         chosen = images, self.seed, device, exposures
-        found = find_shared_points(self.dataset, posed, priors.depths, self.rays, *chosen)
-        return found, "" if found is not None else "no two images show a point at the same depth"
+        points = find_shared_points(self.dataset, posed, priors.depths, self.rays, *chosen)
+        return points, "" if points is not None else "no two images show a point at the same depth"
 
     def exposure_of(
         self,

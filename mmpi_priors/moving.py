@@ -100,11 +100,11 @@ def find_moving(
     near = [neighbours(images, i, keys) for i in range(len(shots))]
     masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
     nothing, first = masks.copy(), {}
-    if says := too_few_depths(shots):
-        return [shot.view for shot in shots], nothing, says
+    if message := too_few_depths(shots):
+        return [shot.view for shot in shots], nothing, message
 
     def look(i: int) -> tuple[Mask, _Look]:
-        return _moves(shots, near[i], i, nothing, nothing[i], None)
+        return _moving_pixels(shots, near[i], i, nothing, nothing[i], None)
 
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
         part = key_images(images, points_of, FIRST)
@@ -115,7 +115,7 @@ def find_moving(
         uprights = upright_objects(shots, near, masks, pool)
         masks = [mask | more for mask, more in zip(masks, uprights, strict=True)]
         again = [i for i in first if any(masks[j].any() for j in near[i])]
-        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, uprights[i], first[i]), again))
+        second = list(pool.map(lambda i: _moving_pixels(shots, near[i], i, masks, uprights[i], first[i]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
         looks = {i: look for i, (_, look) in zip(again, second, strict=True)}
@@ -301,7 +301,7 @@ class _Look:
     swept: Sweep
     levels: NDArray[np.int16]
     """Of ``seeds``. [h, w]"""
-    shown: Evidence
+    weighed: Evidence
     core: Mask
     """Pixels that certainly move, from which objects grow. [h, w]"""
 
@@ -313,7 +313,7 @@ def _others(
     return [Neighbour.of(shots[i], shots[j], gain) for j, gain in zip(near, gains, strict=True)]
 
 
-def _moves(
+def _moving_pixels(
     shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], uprights: Mask, first: _Look | None
 ) -> tuple[Mask, _Look]:
     """Moving pixels of an image by its own evidence, given the masks of others and where it sees their objects."""
@@ -322,11 +322,11 @@ def _moves(
     others = _others(shots, near, i, gains)
     swept = first.swept if first else sweep(shot, others)
     levels = first.levels if first else np.full(uprights.shape, UNASKED, np.int16)
-    shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
-    core = uprights | (swept.certain & ~is_static(shot, shown))
+    weighed = evidence(shot, others, [masks[j] for j in near], swept.impossible)
+    core = uprights | (swept.certain & ~is_static(shot, weighed))
     if len(others) >= 2:
-        core |= seeds(shot, others, shown, levels)
-    return grown(shot, shown, core), _Look(gains, swept, levels, shown, core)
+        core |= seeds(shot, others, weighed, levels)
+    return grown(shot, weighed, core), _Look(gains, swept, levels, weighed, core)
 
 
 def _followed_on(
@@ -343,11 +343,11 @@ def _followed_on(
     def followed_to(part: Iterable[int], some_of: Callable[[int], Mask]) -> list[Mask]:
         def whole(i: int) -> Mask:
             shot, look = shots[i], looks[i]
-            some = some_of(i) & ~is_static(shot, look.shown)
+            some = some_of(i) & ~is_static(shot, look.weighed)
             if not (some & ~masks[i]).any():
                 return masks[i]
             looks[i] = replace(look, core=look.core | some)
-            return masks[i] | grown(shot, look.shown, looks[i].core)
+            return masks[i] | grown(shot, look.weighed, looks[i].core)
 
         arrived = dict(zip(part, pool.map(whole, part), strict=True))
         return [arrived.get(i, mask) for i, mask in enumerate(masks)]
@@ -389,7 +389,7 @@ def _outlined(
 
     def outline(i: int) -> Mask:
         others = _others(shots, near[i], i, looks[i].gains)
-        return outlined(shots[i], others, [masks[j] for j in near[i]], masks[i], looks[i].core, looks[i].shown.noise)
+        return outlined(shots[i], others, [masks[j] for j in near[i]], masks[i], looks[i].core, looks[i].weighed.noise)
 
     part = [i for i in looks if masks[i].any()]
     better = dict(zip(part, pool.map(outline, part), strict=True))

@@ -74,15 +74,18 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], mask
         return most_alike(torch.from_numpy(view.gray), compared(view, views, masks[some]), depths, least, most, False)
 
     alike, at = best(slice(AFTER), depths)
-    stands, moves, inverse = alike[0].numpy(), alike[2].numpy(), at[2].numpy()
+    stands, is_moving, inverse = alike[0].numpy(), alike[2].numpy(), at[2].numpy()
     if len(others) > AFTER:
         rest = best(slice(AFTER, STATIC), depths[(depths >= 0) & (depths <= most)])
         stands = np.maximum(stands, rest.alike[0].numpy())
     scatter = np.abs(inverse - cv2.medianBlur(inverse, 5)) / float(depths[1] - depths[0])
     textured = view.inside & (mean_and_contrast(view.gray)[1] > CONTRAST)
-    moves = (moves > ALIKE) & (moves > stands + BETTER) & textured
+    is_moving = (is_moving > ALIKE) & (is_moving > stands + BETTER) & textured
     masked = cv2.resize(mask.astype(np.uint8), small, interpolation=cv2.INTER_NEAREST) > 0
-    parts = solid(moves & (scatter <= COHERENT), ground), whole_objects(moves & (scatter <= SCATTERED), ground, masked)
+    parts = (
+        solid(is_moving & (scatter <= COHERENT), ground),
+        whole_objects(is_moving & (scatter <= SCATTERED), ground, masked),
+    )
     enlarged = (
         cv2.resize(part.astype(np.uint8), nothing.shape[::-1], interpolation=cv2.INTER_NEAREST) for part in parts
     )
@@ -90,7 +93,7 @@ def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], mask
     return Carried(*(cv2.erode(part, np.ones((INSIDE, INSIDE), np.uint8)) > 0 for part in enlarged))
 
 
-def whole_objects(moves: Mask, ground: Map, masked: Mask) -> Mask:
+def whole_objects(is_moving: Mask, ground: Map, masked: Mask) -> Mask:
     """Large objects, not masked yet, with scattered moving pixels (paint has no texture). [h, w]
 
     Args:
@@ -98,11 +101,11 @@ def whole_objects(moves: Mask, ground: Map, masked: Mask) -> Mask:
         ground: inverse depth of the ground, 0 near the horizon and above. [h, w]
         masked: moving objects so far. [h, w]
     """
-    around = np.pad(moves.astype(np.uint8), CLOSED)
+    around = np.pad(is_moving.astype(np.uint8), CLOSED)
     closed = cv2.morphologyEx(around, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSED, CLOSED)))
     opened = cv2.morphologyEx(closed[CLOSED:-CLOSED, CLOSED:-CLOSED], cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
     number, labels, boxes, _ = cv2.connectedComponentsWithStats(opened)
-    horizon, result = np.count_nonzero((ground == 0).any(1)), np.zeros_like(moves)
+    horizon, result = np.count_nonzero((ground == 0).any(1)), np.zeros_like(is_moving)
     for label in range(1, number):
         part, (_, top, _, height, pixels) = labels == label, boxes[label]
         is_high = top - horizon <= UP * max(top + height - horizon, 0)

@@ -156,8 +156,8 @@ def splat(shot: Shot, other: Shot) -> Map:
         (SPARSE * c.astype(np.float32) + 0.5 for c in measured),
     )
     right, down, ahead = (m[0] * x + m[1] * y + (m[2] + inverse * shift) for m, shift in zip(a, b, strict=True))
-    shown = (ahead > 0) & (right >= 0) & (right < width * ahead) & (down >= 0) & (down < height * ahead)
-    right, down, ahead, inverse = (part[shown] for part in (right, down, SPARSE * ahead, inverse))
+    visible = (ahead > 0) & (right >= 0) & (right < width * ahead) & (down >= 0) & (down < height * ahead)
+    right, down, ahead, inverse = (part[visible] for part in (right, down, SPARSE * ahead, inverse))
     result = np.zeros((-(-height // SPARSE), -(-width // SPARSE)), np.float32)
     places = (  # a quotient may round up to the first square beyond the border
         np.minimum((part / ahead).astype(int), squares - 1)
@@ -241,9 +241,9 @@ class Neighbour:
         color = np.asarray(cv2.LUT(other.color, levels[:, None]), np.uint8)
         return Neighbour(other, color, Warp.between(shot.view, other.view))
 
-    def with_still(self, moves: Mask | None) -> Bytes:
+    def with_still(self, is_moving: Mask | None) -> Bytes:
         """Colours, and ALL inside the lens where nothing is masked as moving, else 0. [h, w, 4]"""
-        still = self.shot.view.inside if moves is None else self.shot.view.inside & ~moves
+        still = self.shot.view.inside if is_moving is None else self.shot.view.inside & ~is_moving
         layer = np.asarray(cv2.cvtColor(self.color, cv2.COLOR_BGR2BGRA), np.uint8)
         layer[..., 3] = 0
         layer[1:-1, 1:-1, 3] = all_where(still[1:-1, 1:-1])

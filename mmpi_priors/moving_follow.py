@@ -55,13 +55,13 @@ class Half:
     """Number of the object that moves there, from 1 on. [h, w]"""
 
     @staticmethod
-    def of(shot: Shot, moves: Mask) -> Half:
+    def of(shot: Shot, is_moving: Mask) -> Half:
         view, measured = shot.view.reduced(2), shot.depth.inverse[shot.depth.inverse > 0]
         height, width = view.gray.shape
         ground = np.zeros((height, width), np.float32) if shot.ground is None else shot.ground
         ground = np.asarray(cv2.resize(ground, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
         color = np.asarray(cv2.resize(shot.color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-        small = cv2.resize(moves.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        small = cv2.resize(is_moving.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         objects = cv2.connectedComponents(small, ltype=cv2.CV_16U)[1].astype(np.int16)
         nearest = float(np.percentile(measured, 98)) if len(measured) else 0.0
         return Half(view, color, shot.color, nearest, ground, objects)

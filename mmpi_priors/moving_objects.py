@@ -108,8 +108,8 @@ def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> ND
             x, y, ahead = other.warp.at(at, len(inverse)).places(inverse)
             low, high = (look_up(image, x + 0.5, y + 0.5, nearest=True) for image in (low, high))
             apart = most_of_channels(cv2.max(cv2.subtract(low, color), cv2.subtract(color, high)))
-            shown = (cv2.extractChannel(high, 3) > 0) & (ahead > 0)
-            distances.append(np.minimum(apart, np.uint8(ALL - 1)) | all_where(~shown))
+            visible = (cv2.extractChannel(high, 3) > 0) & (ahead > 0)
+            distances.append(np.minimum(apart, np.uint8(ALL - 1)) | all_where(~visible))
         _, second = two_least(distances)
         levels[left] = np.minimum(levels[left], np.where((second < ALL).all(0), second.min(0), 0))
         left = left[levels[left] > LEAST_LEVELS]
@@ -229,7 +229,7 @@ def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> M
     inner = mask.astype(np.uint8)
     if not turned(shot.view, other.view):
         inner = cv2.erode(inner, np.ones((INNER, INNER), np.uint8))
-    moves = cv2.remap(inner, x, y, cv2.INTER_NEAREST) * (ahead > 0)
+    is_moving = cv2.remap(inner, x, y, cv2.INTER_NEAREST) * (ahead > 0)
     seen = np.asarray(cv2.remap(other.view.gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     there = np.asarray(flow.calc(gray, seen, None))  # type: ignore[call-overload]
     back = np.asarray(flow.calc(seen, gray, None))  # type: ignore[call-overload]
@@ -237,4 +237,4 @@ def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> M
     at = x + there[..., 0], y + there[..., 1]
     returned = np.abs(there + look_up(back, *at)).max(-1) < 1.5
     alike = correlation(gray, look_up(seen, *at), mean_and_contrast(gray))
-    return returned & (alike > FOLLOWED) & (look_up(moves, *at, nearest=True) > 0)
+    return returned & (alike > FOLLOWED) & (look_up(is_moving, *at, nearest=True) > 0)

@@ -55,9 +55,9 @@ def outlined(
     near = cv2.dilate(left.astype(np.uint8), _disc(2 * AROUND + 1)) > 0
     joins = near & (unlike > noise + UNLIKE) & (unlike < ALL)
     both = cv2.morphologyEx((left | joins).astype(np.uint8), cv2.MORPH_OPEN, _disc(OPENED)) > 0
-    shown = filled(touching(both | left, left))
+    visible = filled(touching(both | left, left))
     # Pixels along an outline mix both sides.
-    return shown | ((cv2.dilate(shown.astype(np.uint8), _disc(3)) > 0) & (unlike >= noise + EXPLAINED))
+    return visible | ((cv2.dilate(visible.astype(np.uint8), _disc(3)) > 0) & (unlike >= noise + EXPLAINED))
 
 
 def _disc(across: int) -> Bytes:

@@ -74,12 +74,12 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
     least = torch.from_numpy(BELOW * ground - MARGIN * largest)
     near = compared(view, [other.shot.view.reduced(2) for other in others[:NEIGHBOURS]])
     alike, at = most_alike(torch.from_numpy(view.gray), near, depths, least, np.inf, True)
-    (stands, moves, _), (possible, false, _) = alike.numpy(), at.numpy()
-    inverse = np.where(moves >= stands, false, possible)
-    inverse = np.where((np.maximum(moves, stands) > MEASURED) & (contrast > MEASURED_CONTRAST), inverse, 0)
+    (stands, is_moving, _), (possible, false, _) = alike.numpy(), at.numpy()
+    inverse = np.where(is_moving >= stands, false, possible)
+    inverse = np.where((np.maximum(is_moving, stands) > MEASURED) & (contrast > MEASURED_CONTRAST), inverse, 0)
     coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
     textured = view.inside & (contrast > CONTRAST)
-    below = (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
+    below = (is_moving > ALIKE) & (stands < is_moving - BETTER) & textured & coherent
     views = [shot.view, *(other.shot.view for other in others)]
     air = floats(inverse, ground) if is_straight(views) else np.zeros_like(below)
     below, air = (
@@ -101,9 +101,9 @@ def compared(view: View, others: Sequence[View], masks: Sequence[Mask] | None = 
     return others_of(images, torch.stack(linear), torch.stack(b))
 
 
-def solid(moves: Mask, ground: Map) -> Mask:
+def solid(is_moving: Mask, ground: Map) -> Mask:
     """Moving pixels without specks, lines and objects that do not reach below the horizon. [h, w]"""
-    filled = cv2.boxFilter(moves.astype(np.float32), -1, (SMOOTH, SMOOTH)) > 0.5
+    filled = cv2.boxFilter(is_moving.astype(np.float32), -1, (SMOOTH, SMOOTH)) > 0.5
     number, labels, boxes, _ = cv2.connectedComponentsWithStats(filled.astype(np.uint8))
     stands = np.bincount(labels.ravel(), (ground > 0).ravel(), number) / boxes[:, cv2.CC_STAT_AREA]
     kept = (boxes[:, cv2.CC_STAT_AREA] >= LEAST_PIXELS) & (stands > STANDS)
@@ -138,9 +138,9 @@ def floats(inverse: Map, ground: Map) -> Mask:
         part = labels[window] == label
         last = len(part) - 1 - part[::-1].argmax(0)
         columns = np.arange(part.shape[1])
-        shown = whole[window] & (np.arange(len(part))[:, None] > last)
-        first = shown.argmax(0)
-        bare = shown.any(0) & on_ground[window][first, columns] & (ground[window][last, columns] > 0)
+        visible = whole[window] & (np.arange(len(part))[:, None] > last)
+        first = visible.argmax(0)
+        bare = visible.any(0) & on_ground[window][first, columns] & (ground[window][last, columns] > 0)
         if bare[part.any(0)].mean() > BARE:
             result[window] |= part
     return result

@@ -45,7 +45,7 @@ MOST = 2_000_000
 
 
 @dataclass(frozen=True)
-class ShownImage:
+class SourceImage:
     """An image prepared for comparison with others."""
 
     image: UInt8[ndarray, "H W C"]
@@ -57,10 +57,12 @@ class ShownImage:
     depth: Float[ndarray, "H W 2"]
 
     @staticmethod
-    def of(image: UInt8[ndarray, "H W C"], usable: UInt8[ndarray, "H W"], depth: Float[ndarray, "H W 2"]) -> ShownImage:
+    def of(
+        image: UInt8[ndarray, "H W C"], usable: UInt8[ndarray, "H W"], depth: Float[ndarray, "H W 2"]
+    ) -> SourceImage:
         around = np.ones((3, 3), np.uint8)
         darkest, brightest = (np.asarray(bound(image, around), np.uint8) for bound in (cv2.erode, cv2.dilate))
-        return ShownImage(image, darkest, brightest, usable, depth)
+        return SourceImage(image, darkest, brightest, usable, depth)
 
     def shows(
         self, posed: PosedImages, j: int, points: Float[ndarray, "P 3"], colors: Float[ndarray, "P C"]
@@ -93,7 +95,7 @@ def find_shared_points(
     """
     # Neighbouring cameras mostly have neighbouring numbers.
     show = held(
-        lambda i: ShownImage.of(*image_and_mask(dataset, i), depths.image(i)),
+        lambda i: SourceImage.of(*image_and_mask(dataset, i), depths.image(i)),
         posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1,
     )  # fmt: skip
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
@@ -114,7 +116,7 @@ def find_shared_points(
 def _matches(
     i: int,
     images: Sequence[int],
-    show: Callable[[int], ShownImage],
+    show: Callable[[int], SourceImage],
     posed: PosedImages,
     rays: Rays,
     most: int,
@@ -126,9 +128,9 @@ def _matches(
     At most ``most`` of its pixels with a certain depth are compared. The second result is the estimated number of
     matches of all of them.
     """
-    shown = show(i)
-    inverse, error = shown.depth[..., 0], shown.depth[..., 1]
-    rows, columns = np.nonzero((inverse > 0) & (error < CERTAIN * inverse) & (shown.usable > 0))
+    source = show(i)
+    inverse, error = source.depth[..., 0], source.depth[..., 1]
+    rows, columns = np.nonzero((inverse > 0) & (error < CERTAIN * inverse) & (source.usable > 0))
     count, parts, matches = len(rows), [], 0.0
     if count > most:
         chosen = np.sort(np.random.default_rng((seed, i)).choice(count, most, replace=False))
@@ -136,7 +138,7 @@ def _matches(
     if not count:
         return parts, matches
     pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
-    depths, colors = shown.depth[rows, columns], shown.image[rows, columns]
+    depths, colors = source.depth[rows, columns], source.image[rows, columns]
     directions = rays(pixels).directions.double().cpu().numpy()
     points = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1]
     for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):

@@ -85,7 +85,7 @@ def observe(
         else:
             angles = keypoint_angles(observations, dataset.cameras)
             off = np.median(angles * observations.intrinsics[observations.seen_by, 0])
-            tell_poses(float(off), Path(outputs.image_filenames[0]))
+            warn_of_poses(float(off), Path(outputs.image_filenames[0]))
         observations = drop_masked(observations, dataset)
     return observations
 
@@ -116,7 +116,7 @@ def _find_points(
         CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
         observations = with_tracks(observations, model)
         if not check(originals, model):
-            tell_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
+            warn_of_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
     if images is not None and len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
         CONSOLE.print("Few or no tracks: a quick search for surfaces locates the content.")
         observations = with_surfaces(observations, at_full_size(images))
@@ -179,28 +179,28 @@ def check_cameras(matrices: Array, images: PosedImages, model: SfmModel, *, trus
         return False
     focal, pixels = float(images.intrinsics[0, 0]), float(width.mean())
     if better is None:
-        says = (
+        message = (
             f"The cameras contradict their images: matches are off by {as_given.error:.1%} of the width, and "
             "no usual convention of axes, inversion, focal length or lens explains them. Are the poses those of "
             "other images, or in another order?"
         )
     else:
-        says = in_words(better, OPENGL, focal, pixels, as_given.error)
-        says = f"The cameras contradict their images. {says}"
+        message = in_words(better, OPENGL, focal, pixels, as_given.error)
+        message = f"The cameras contradict their images. {message}"
         full = images.files[0].parent
         if better.is_of_axes(OPENGL):
             to, poses = full.parent.with_name(f"{full.parent.name}-converted"), full.parent / "transforms.json"
             command = f"mmpi-prepare {quoted(full)} {quoted(to)} --poses {quoted(poses)}"
-            says = f"{says} Convert them: {command} reads them so."
+            message = f"{message} Convert them: {command} reads them so."
         else:
-            says = f"{says} Correct the intrinsics in transforms.json."
+            message = f"{message} Correct the intrinsics in transforms.json."
     if is_wrong and not trusts:
-        raise InputError(f"{says} To train all the same: --pipeline.datamanager.priors.trust-cameras True.")
-    CONSOLE.print(says, style="bold yellow", markup=False, soft_wrap=True)
+        raise InputError(f"{message} To train all the same: --pipeline.datamanager.priors.trust-cameras True.")
+    CONSOLE.print(message, style="bold yellow", markup=False, soft_wrap=True)
     return True
 
 
-def tell_poses(off: float, image: Path) -> None:
+def warn_of_poses(off: float, image: Path) -> None:
     """Reports poses that matches or keypoints contradict by this many training pixels (median), with the command that
     refines them; ``image`` is one of the training images."""
     if not off > POSES_OFF:  # or not a number, as nothing matched
@@ -208,8 +208,8 @@ def tell_poses(off: float, image: Path) -> None:
     full = image.parent.with_name(re.sub(r"_\d+$", "", image.parent.name))  # images for images_2
     refined, poses = full.parent.with_name(f"{full.parent.name}-refined"), full.parent / "transforms.json"
     command = f"mmpi-prepare {quoted(full)} {quoted(refined)} --poses {quoted(poses)} --refine-poses"
-    says = f"The poses are off by {off:.1f} training pixels (median over the matches of the images)"
-    CONSOLE.print(f"{says}: {command} refines them.", style="bold yellow", markup=False, soft_wrap=True)
+    message = f"The poses are off by {off:.1f} training pixels (median over the matches of the images)"
+    CONSOLE.print(f"{message}: {command} refines them.", style="bold yellow", markup=False, soft_wrap=True)
 
 
 def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:

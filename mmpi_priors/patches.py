@@ -154,8 +154,8 @@ def _certain(view: View, others: Sequence[View], patches: Patches, max_relative:
         x, y, _ = parallax.pixels(inverse)
         moved_x, moved_y, _ = parallax.pixels(inverse + change)
         height, width = other.gray.shape
-        shown = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        moved = np.where(shown, np.hypot(moved_x - x, moved_y - y) / change, 0)
+        visible = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        moved = np.where(visible, np.hypot(moved_x - x, moved_y - y) / change, 0)
         second = np.maximum(second, np.minimum(best, moved))
         best = np.maximum(best, moved)
     error = NOISE / np.maximum(np.where(second > 0, second, best), 1e-12)

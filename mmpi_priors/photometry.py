@@ -153,13 +153,13 @@ def pair_ratios(
     """
     rows, columns = pixels.T
     at = project(cameras, second.number, points)
-    shown = look_up(second.exposed.view(np.uint8), *at.T, nearest=True) > 0
+    visible = look_up(second.exposed.view(np.uint8), *at.T, nearest=True) > 0
     if second.depth is not None:
         center = cameras.camera_to_worlds[second.number, :, 3]
         expected = 1 / np.maximum(np.linalg.norm(points - center, axis=-1), 1e-12)
         inverse = look_up(second.depth[..., 0], *at.T, nearest=True)
-        shown &= np.abs(inverse - expected) < SAME_DISTANCE * expected
-    chosen = np.nonzero(shown)[0]
+        visible &= np.abs(inverse - expected) < SAME_DISTANCE * expected
+    chosen = np.nonzero(visible)[0]
     ratios = np.log(look_up(second.colors, *at[chosen].T) / first.colors[rows[chosen], columns[chosen]])
     if second.depth is None and len(chosen):
         chosen, ratios = (x[np.abs(ratios - np.median(ratios, 0)).max(-1) < HIDDEN] for x in (chosen, ratios))

@@ -166,9 +166,9 @@ def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats
         view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
         colors = (splats.basis(view.to_world[:, 3])[:, :, None] * splats.colors).sum(1).clamp(0, 1)
         image = splat_image(gaussians, view, colors)
-        shown = image[..., :3] + window.background * image[..., 3:]
-        missing = window.render(*pose.rays())["rgb"].view(shown.shape) - shown
-        return view, splat_errors(gaussians, view, colors, shown, missing)
+        rendered = image[..., :3] + window.background * image[..., 3:]
+        missing = window.render(*pose.rays())["rgb"].view(rendered.shape) - rendered
+        return view, splat_errors(gaussians, view, colors, rendered, missing)
 
     for view, sums in in_order(errors_in, poses):
         opacities += sums[:, 4:]

@@ -73,16 +73,16 @@ class BakedWindow:
             background: colour of the background; None: the window's.
         """
         rays = Rays(*(x.cpu() for x in (origins, directions, *(bounds or self.unbounded(origins)))))
-        shown = render_baked(self.mpis, rays, self.threshold)
-        shaded = shade_baked(self.shader, shown.gathered, shown.mass, rays.directions)
-        rgb = torch.where(shown.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
+        marched = render_baked(self.mpis, rays, self.threshold)
+        shaded = shade_baked(self.shader, marched.gathered, marched.mass, rays.directions)
+        rgb = torch.where(marched.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
         behind = self.background if background is None else background.cpu()
         outputs = {
-            "rgb": (rgb * shown.accumulation + behind * shown.transmittance).clamp(0, 1),
-            "accumulation": shown.accumulation,
-            "depth": 1 / shown.inverse_t.clamp(min=1 / self.farthest),
-            "winning_mpi": shown.winner,
-            "dropped_mass": shown.dropped_mass,
+            "rgb": (rgb * marched.accumulation + behind * marched.transmittance).clamp(0, 1),
+            "accumulation": marched.accumulation,
+            "depth": 1 / marched.inverse_t.clamp(min=1 / self.farthest),
+            "winning_mpi": marched.winner,
+            "dropped_mass": marched.dropped_mass,
         }
         return {name: values.to(origins.device) for name, values in outputs.items()}
 

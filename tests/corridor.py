@@ -79,12 +79,12 @@ def write_images(folder: Path, count=14, seed=0, start=0, bend=0.01):
     return chosen
 
 
-def error_of(names, found, count):
+def error_of(names, actual, count):
     """Largest distance of the centres of poses [N, 4, 4] from the true ones of ``count`` frames, as a share of the
     track."""
     given = poses(count)[[int(Path(name).stem[-3:]) - 1 for name in names]]
-    moved = similarity_between(found, given)
-    off = [np.linalg.norm(moved * p - q) for p, q in zip(found[:, :3, 3], given[:, :3, 3], strict=True)]
+    moved = similarity_between(actual, given)
+    off = [np.linalg.norm(moved * p - q) for p, q in zip(actual[:, :3, 3], given[:, :3, 3], strict=True)]
     return max(off) / np.linalg.norm(np.diff(given[:, :3, 3], axis=0), axis=-1).sum()
 
 

@@ -58,7 +58,7 @@ class Ended:
         return said
 
     @property
-    def shown(self) -> str:
+    def printed(self) -> str:
         """What a run that did not end early printed, in one line."""
         assert self.status == 0, (self.status, self.out[-2000:], self.error[-4000:])
         assert "Traceback" not in self.error + self.out, self.error[-4000:]
@@ -68,10 +68,10 @@ class Ended:
 class Running:
     """A command that has been started."""
 
-    def __init__(self, name, options, arguments, memory, environment=None, shown_on=None):
+    def __init__(self, name, options, arguments, memory, environment=None, printed_to=None):
         self.folder = Path(tempfile.mkdtemp(prefix="trust", dir=os.environ["XDG_CACHE_HOME"]))  # conftest removes it
-        for stream in ("out", "error") if shown_on is not None else ():
-            (self.folder / stream).symlink_to(shown_on)
+        for stream in ("out", "error") if printed_to is not None else ():
+            (self.folder / stream).symlink_to(printed_to)
         given = (self.folder, name, options, arguments, memory, environment or {})
         self.process = _context.Process(target=_child, args=given, daemon=True)
         self.process.start()
@@ -113,10 +113,10 @@ def train(data, output, method="mmpi_small", memory=None, **options):
     return start_train(data, output, method, memory, **options).end()
 
 
-def start_train(data, output, method="mmpi_small", memory=None, environment=None, shown_on=None, **options):
+def start_train(data, output, method="mmpi_small", memory=None, environment=None, printed_to=None, **options):
     dotted = {name.replace("__", "."): value for name, value in options.items()}
     given = CALM | {"data": Path(data), "output_dir": Path(output), "method": method} | dotted
-    return Running("ns-train", given, [], memory, environment, shown_on)
+    return Running("ns-train", given, [], memory, environment, printed_to)
 
 
 def _child(folder, name, options, arguments, memory, environment):

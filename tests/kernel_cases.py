@@ -41,7 +41,7 @@ SMALL = Shapes()
 
 def differences(name: str, device: str, shapes: Shapes = SMALL) -> list[float]:
     """Of the GPU form of an operation and its definition, relative to the largest number, for each case."""
-    found = []
+    actual = []
     for arguments in CASES[name](device, shapes):
         kernel = _outcome(name, "gpu", arguments)
         with dispatch.chosen("torch"):
@@ -49,8 +49,8 @@ def differences(name: str, device: str, shapes: Shapes = SMALL) -> list[float]:
         for a, b in zip(kernel, reference, strict=True):
             assert a.shape == b.shape, name
             if b.numel():
-                found.append(float((a.double() - b.double()).abs().max() / b.double().abs().max().clamp(min=1e-6)))
-    return found
+                actual.append(float((a.double() - b.double()).abs().max() / b.double().abs().max().clamp(min=1e-6)))
+    return actual
 
 
 def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:

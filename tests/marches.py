@@ -41,10 +41,10 @@ def compare(field, rays, threshold, blends=False, least=0.95, ndc=2e-6, inverse_
 def behind_an_opaque_plane_nothing_is_visited_and_a_hundred_thousandth_is_lost():
     field = MMPIField(ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)).eval()
     field.density.data[field.grids[0].rows[: 10 * field.grids[0].height * field.grids[0].width]] = 30.0
-    found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
-    assert found.samples.num_intersected.item() == 64 and found.samples.valid.sum() == 1
-    assert found.samples.skipped_total.item() == 0 and found.samples.dropped_mass.item() <= 1e-5
-    assert found.composite.accumulation.item() == pytest.approx(1, abs=1e-5)
+    actual = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
+    assert actual.samples.num_intersected.item() == 64 and actual.samples.valid.sum() == 1
+    assert actual.samples.skipped_total.item() == 0 and actual.samples.dropped_mass.item() <= 1e-5
+    assert actual.composite.accumulation.item() == pytest.approx(1, abs=1e-5)
 
 
 def nothing_is_marched_without_rays_or_samples():

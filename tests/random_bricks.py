@@ -26,8 +26,8 @@ def random_window(num_mpis=2, seed=0, planes=40, channels=5, stored=0.5, density
     columns, count = [], 0
     for mpi in mpis:
         _, down, across = tiles_of(mpi)
-        found, places = columns_from(torch.rand(mpi.planes, down, across, generator=g) < stored, count)
-        columns.append(found)
+        actual, places = columns_from(torch.rand(mpi.planes, down, across, generator=g) < stored, count)
+        columns.append(actual)
         count += len(places)
     codes = torch.randint(density[0], density[1] + 1, (count, 8, 8), generator=g, dtype=torch.uint8)
     texels = torch.randint(0, 256, (count, 8, 8, channels), generator=g, dtype=torch.uint8)

@@ -119,13 +119,13 @@ def _color(networks, k, features, ndc, direction):
 
 def _places(plan, origin, direction, inverse_t):
     """NDC of a point in every head, None where it is behind an MPI or, in the cube, at infinity."""
-    found = [oracle.place_in(m, origin, direction, inverse_t) for m in plan.mpis]
-    found = [None if place is None else place[0] for place in found]
+    actual = [oracle.place_in(m, origin, direction, inverse_t) for m in plan.mpis]
+    actual = [None if place is None else place[0] for place in actual]
     if plan.cube is not None:
         lower, upper = np.array(plan.cube.lower), np.array(plan.cube.upper)
         point = None if inverse_t == 0 else origin + direction / inverse_t
-        found.append(None if point is None else 2 * (point - lower) / (upper - lower) - 1)
-    return found
+        actual.append(None if point is None else 2 * (point - lower) / (upper - lower) - 1)
+    return actual
 
 
 class OracleRay:
@@ -135,17 +135,17 @@ class OracleRay:
         self.field, self.origin, self.direction = field, origin, direction
         self.margin, self.heads, plan = math.inf, [], field.plan
         for k, mpi in enumerate(plan.mpis):
-            found = oracle.crossings(mpi, origin, direction, near, far)
-            self.margin = min(self.margin, float(found.margin.min()))
+            actual = oracle.crossings(mpi, origin, direction, near, far)
+            self.margin = min(self.margin, float(actual.margin.min()))
             self.heads.append(
-                [self._sample(k, p, found.inverse_t[p]) for p in np.flatnonzero(found.intersected).tolist()]
+                [self._sample(k, p, actual.inverse_t[p]) for p in np.flatnonzero(actual.intersected).tolist()]
             )
         if plan.cube is not None:
             sides = [(b - a) / (n - 1) for a, b, n in zip(plan.cube.lower, plan.cube.upper, plan.cube.shape[::-1])]  # noqa: B905
             step = min(sides) / field.samples_per_voxel
-            found, margin = oracle.cube_samples(plan.cube, step, origin, direction, near, far)
+            actual, margin = oracle.cube_samples(plan.cube, step, origin, direction, near, far)
             self.margin = min(self.margin, margin)
-            self.heads.append([self._sample(len(plan.mpis), i, 1 / ((i + 0.5) * step)) for i in found])
+            self.heads.append([self._sample(len(plan.mpis), i, 1 / ((i + 0.5) * step)) for i in actual])
         met = sorted((s.inverse_t, s.head) for head in self.heads for s in head)
         for (a, i), (b, j) in pairwise(met):
             self.margin = min(self.margin, (b - a) / (1 + b) if i != j and a != b else math.inf)
@@ -202,7 +202,7 @@ CLEAR = 2e-5
 
 def compare(field, origins, directions, blends=False, heads_of=None, near=0.05, far=math.inf, error=ERROR, **chosen):
     """Renders all rays at once and each by the oracle; returns the number of clear rays that met something."""
-    found = render(field, bundle(origins, directions, near, far), blends=blends, **chosen)
+    actual = render(field, bundle(origins, directions, near, far), blends=blends, **chosen)
     met = 0
     for i in range(len(origins)):
         ray = OracleRay(field, origins[i], directions[i], near, far)
@@ -210,15 +210,15 @@ def compare(field, origins, directions, blends=False, heads_of=None, near=0.05, 
             continue
         wanted = ray.render(blends, heads_of(i, ray) if heads_of else None)
         count = len(wanted.samples)
-        assert found.samples.num_intersected[i] == count
-        valid = found.samples.valid[i]
+        assert actual.samples.num_intersected[i] == count
+        valid = actual.samples.valid[i]
         assert valid.sum() == count and valid[:count].all()
-        assert found.samples.heads[i, :count].tolist() == [s.head for s in wanted.samples]
-        assert found.samples.planes[i, :count].tolist() == [s.plane for s in wanted.samples]
-        inverse_t = found.samples.inverse_t[i, :count].tolist()
+        assert actual.samples.heads[i, :count].tolist() == [s.head for s in wanted.samples]
+        assert actual.samples.planes[i, :count].tolist() == [s.plane for s in wanted.samples]
+        inverse_t = actual.samples.inverse_t[i, :count].tolist()
         assert inverse_t == pytest.approx([s.inverse_t for s in wanted.samples], rel=1e-4, abs=1e-6)
-        assert np.abs(found.composite.weights[i, :count].numpy() - wanted.weights).max(initial=0) < error
-        assert np.abs(found.rgb[i].numpy() - wanted.color).max() < error
-        assert abs(found.composite.transmittance[i].item() - wanted.transmittance) < error
+        assert np.abs(actual.composite.weights[i, :count].numpy() - wanted.weights).max(initial=0) < error
+        assert np.abs(actual.rgb[i].numpy() - wanted.color).max() < error
+        assert abs(actual.composite.transmittance[i].item() - wanted.transmittance) < error
         met += count > 0
     return met

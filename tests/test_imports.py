@@ -44,14 +44,14 @@ MODULES = {
 def imported(node: ast.AST, name: str) -> list[str]:
     """Modules of our packages that an import statement reads."""
     if isinstance(node, ast.Import):
-        found = [alias.name for alias in node.names]
+        actual = [alias.name for alias in node.names]
     elif isinstance(node, ast.ImportFrom):
         assert node.level == 0, f"{name}: write imports in full"
         inside = [f"{node.module}.{alias.name}" for alias in node.names]
-        found = [each if each in MODULES else str(node.module) for each in inside]
+        actual = [each if each in MODULES else str(node.module) for each in inside]
     else:
-        found = []
-    return [each for each in found if each.split(".")[0] in ("mmpi_ns", *COMPANIONS)]
+        actual = []
+    return [each for each in actual if each.split(".")[0] in ("mmpi_ns", *COMPANIONS)]
 
 
 def imports(name: str) -> set[str]:

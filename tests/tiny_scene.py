@@ -123,8 +123,8 @@ def equidistant(points):
 def undistort(x, y, lens):
     """Tangents whose OpenCV distortion (k1, k2, p1, p2) falls on (x, y), y down."""
     points, whole = np.stack([x, y], -1).reshape(-1, 1, 2), np.eye(3)
-    found = cv2.undistortPointsIter(points, whole, np.array([*lens]), whole, whole, (3, 60, 1e-12))
-    return np.moveaxis(found.reshape(*x.shape, 2), -1, 0)
+    actual = cv2.undistortPointsIter(points, whole, np.array([*lens]), whole, whole, (3, 60, 1e-12))
+    return np.moveaxis(actual.reshape(*x.shape, 2), -1, 0)
 
 
 def wall_points():

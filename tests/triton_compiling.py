@@ -136,5 +136,5 @@ def resources(kernel):
 def spills(kernel):
     """Whether registers of a compiled kernel go to memory. A stack alone, of a few bytes, says nothing where the kernel
     does not take all registers that there are."""
-    found = resources(kernel)
-    return "STACK:0" not in found and "REG:255" in found
+    actual = resources(kernel)
+    return "STACK:0" not in actual and "REG:255" in actual

@@ -1,4 +1,4 @@
-"""Compiles C++: the operations of each package into one library, by the machine's own compiler, at first use."""
+"""Compilation of C++: the operations of each package become one library, at first use."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from mmpi_ns.utils.files import cache_folder
 from mmpi_ns.utils.parallel import num_threads
 
 OPS = Path(__file__).parent
-"""Folder of the method's operations; packages beside it have folders like it."""
+"""Folder of the method's operations; the companion packages have such folders too."""
 HEADERS = OPS / "cpp"
 FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{HEADERS}"]
-"""No option that reorders sums, so that results do not depend on the compiler."""
+"""Compiler options; none reorders sums, so that results do not depend on the compiler."""
 FORMS = {int: ctypes.c_int64, bool: ctypes.c_bool, float: ctypes.c_float}
-"""What numbers are passed as."""
+"""C types of Python numbers."""
 ENTRIES_PER_PART = 1024
-"""Entries that are looked at to divide sums evenly among threads."""
+"""Entries sampled to divide sums evenly among threads."""
 MOST_PARTS = (1 << 16) - 1
-"""Of a function that is left to other threads (``cpp/parts.h``)."""
+"""Suffix of functions that other threads run later (``cpp/parts.h``)."""
 
 
 class CannotCompile(Exception):
-    """The reason why there is no library."""
+    """Compilation is not possible; the message is the reason."""
 
 
 def compiler() -> list[str]:
@@ -82,7 +82,7 @@ def library(folder: Path = OPS) -> ctypes.CDLL:
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             return _compiled(command, target, target.parent)
-        except (OSError, subprocess.CalledProcessError):  # full or not to be written: each process compiles its own
+        except (OSError, subprocess.CalledProcessError):  # full or read-only: each process compiles its own
             return _compiled(command, target, None)
     except subprocess.CalledProcessError as error:
         words = (error.stderr or "").strip() or f"exit status {error.returncode}"
@@ -92,7 +92,7 @@ def library(folder: Path = OPS) -> ctypes.CDLL:
 
 
 def _compiled(command: list[str], target: Path, folder: Path | None) -> ctypes.CDLL:
-    """Compiles the library in a folder of the target's disk and keeps it; where there is none, in a temporary one."""
+    """The library, compiled in a folder on the target's disk and kept there, or in a temporary one."""
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         unfinished = Path(scratch) / target.name
         subprocess.run([*command, "-o", str(unfinished)], check=True, capture_output=True, text=True, timeout=600)
@@ -118,7 +118,7 @@ def arguments(values: Iterable[Any]) -> list[Any]:
 
 
 def structs(*rows: Sequence[Any]) -> ctypes.Array:
-    """C++ structs of these fields (see ``arguments``), one behind the other; what they point to lives as long."""
+    """Contiguous C++ structs of these fields (see ``arguments``), which keep alive what they point to."""
     fields = [tuple(arguments(row)) for row in rows]
     array = (_struct(*map(type, fields[0])) * len(rows))(*fields)
     array.held = rows  # type: ignore[attr-defined]
@@ -131,8 +131,8 @@ def _struct(*types: type) -> type[ctypes.Structure]:
 
 
 def call_in_parts(name: str, parts: int | Sequence[int], *values: Any, least: int = 256, folder: Path = OPS) -> None:
-    """Calls a compiled function of ``(begin, end, *values)`` for parts of some numbers, each by a thread
-    (``cpp/parts.h``). Parts must not write to one place.
+    """Calls a compiled function of ``(begin, end, *values)`` for parts of a range, each by a thread
+    (``cpp/parts.h``). Parts must not write to the same memory.
 
     Args:
         name: of the function.
@@ -147,18 +147,18 @@ def call_in_parts(name: str, parts: int | Sequence[int], *values: Any, least: in
 
 
 class Pending:
-    """A compiled function that other threads work on while they have nothing else to do."""
+    """A compiled function that idle threads work on."""
 
     def __init__(self, name: str, number: int, values: Sequence[Any]) -> None:
-        self._values = values  # live as long
+        self._values = values  # kept alive
         self.finish = functools.partial(_function(f"{name}_finish"), ctypes.c_int64(number))
         """Returns when the function has written all of its results."""
         weakref.finalize(self, self.finish)  # before the values go, at the latest at the end of the process
 
 
 def leave_in_parts(name: str, count: int, size: int, *values: Any) -> Pending | None:
-    """Leaves a compiled function of ``(begin, end, *values)`` for 0 to ``count`` to other threads, which call it for
-    ``size`` numbers at a time. None where there are too few numbers or no other threads: nothing is called.
+    """A compiled function of ``(begin, end, *values)`` for 0 to ``count``, to be called by other threads for ``size``
+    numbers at a time. None if there are too few numbers or no other threads: nothing is called then.
 
     Args:
         name: of the function, which has LATER_IN_PARTS in ``cpp/parts.h``.
@@ -188,10 +188,10 @@ def even_bounds(count: int, least: int = 256) -> list[int]:
 def owned_bounds(positions: Sequence[Int[Tensor, "N B"]], count: int, least: int) -> list[int]:
     """Bounds of parts of rows 0..count with about as many entries each, for sums by row.
 
-    A row has one owner, who adds all its entries in order: no sum depends on where the bounds lie.
+    One thread adds all entries of a row in order, so that sums do not depend on the bounds.
 
     Args:
-        positions: rows of all entries; some of them are looked at.
+        positions: rows of all entries, of which a sample is read.
         count: of the rows.
         least: entries that each part gets (see ``even_bounds``).
     """

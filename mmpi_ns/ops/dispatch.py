@@ -1,8 +1,7 @@
 """Operations, and the choice of their form: the reference in plain torch, C++ on a CPU, or Triton kernels on a GPU.
 
-``--pipeline.model.ops`` chooses for the whole process. Where there is no compiler, or no Triton, the references run and
-the log says why. Whether kernels agree with the references on a GPU is seen before the first step
-(``training/agreement.py``).
+``--pipeline.model.ops`` chooses for the whole process. Without a compiler or Triton, the references run and the log
+gives the reason. On a GPU, kernels are compared with the references before the first step (``training/agreement.py``).
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 OLDEST_TRITON = (3, 1)
-"""The kernels compile with this and newer ones; torch brings it since 2.5."""
+"""Oldest Triton that compiles the kernels; part of torch since 2.5."""
 
 _PRECISIONS = (torch.float32, torch.bfloat16)
 _chosen: Route = "auto"
@@ -45,9 +44,8 @@ _choosing = threading.RLock()
 
 
 class Operation(Generic[P, R]):
-    """A function that is defined in plain torch, with compiled forms of the same signature: for a CPU (C++, ``on_cpu``)
-    and for a GPU (Triton, of the same name in the module ``gpu`` beside it). A call takes the form that suits the
-    tensors among its arguments.
+    """A function defined in plain torch, with compiled forms of the same signature: for a CPU (C++, ``on_cpu``) and for
+    a GPU (Triton, of the same name in the module ``gpu`` beside it). A call takes the form that suits its tensors.
 
     Raises:
         ValueError: by a call: the shape of a tensor is not that of its annotation (``layout.py``).
@@ -67,14 +65,14 @@ class Operation(Generic[P, R]):
         self.kernels = kernels or reference.__module__
         """The module of its compiled forms, with ``gpu`` beside it."""
         self.folder = Path(str(sys.modules[self.kernels].__file__)).parents[1]
-        """Of the package's operations: one library."""
+        """Folder of the package's operations, compiled into one library."""
         OPERATIONS[self.name] = self
         if in_cpp is not None:
             self.hints, self.least = get_type_hints(reference), in_cpp
             self.on_cpu(functools.update_wrapper(functools.partial(self._in_cpp), reference))
 
     def on_cpu(self, form: Callable[P, R]) -> Callable[P, R]:
-        """Makes a function the form for a CPU."""
+        """Decorator of the form for a CPU."""
         self.compiled.append("cpu")
         self.cpu = form
         return form
@@ -125,7 +123,7 @@ class Operation(Generic[P, R]):
 
 
 OPERATIONS: dict[str, Operation[..., Any]] = {}
-"""Every operation that has been imported, by its name."""
+"""Imported operations by name."""
 
 
 def operation(
@@ -134,11 +132,11 @@ def operation(
     in_cpp: int | None = None,
     kernels: str | None = None,
 ) -> Callable[[Callable[P, R]], Operation[P, R]]:
-    """Makes an operation of a function.
+    """Decorator that makes a function an operation.
 
     Args:
         compiled: the forms in modules beside it.
-        check: takes the same arguments and raises what their annotations cannot say.
+        check: takes the same arguments and raises errors that annotations cannot express.
         in_cpp: the form for a CPU is ``mmpi_NAME`` in C++ (``Operation._in_cpp``); rows of its first result that are
             worth another thread, 0: one thread computes all.
         kernels: module of the compiled forms, where it is not the definition's.
@@ -147,7 +145,7 @@ def operation(
 
 
 def on_gpu(x: Tensor) -> bool:
-    """Whether the kernels of a GPU take a tensor: nothing may be waited for then."""
+    """Whether the kernels of a GPU take a tensor, so that code must not synchronise."""
     return x.is_cuda or interpreting
 
 
@@ -180,8 +178,8 @@ def function(name: str, form: Form) -> Any:
 
 
 def choose(path: Route) -> None:
-    """Sets the forms of the operations in this process. Raises InputError if ``native`` is asked for and an operation
-    has no compiled form here (says why)."""
+    """Sets the forms of the operations in this process. Raises InputError, with the reason, if ``native`` is requested
+    and an operation has no compiled form here."""
     global _chosen
     _chosen = path
     if path != "native":
@@ -206,8 +204,8 @@ def chosen(path: Route) -> Iterator[None]:
 
 @functools.cache
 def fault(what: Literal["C++", "Triton"], folder: Path = build.OPS) -> str | None:
-    """Why the compiler, for the operations in a folder, or Triton cannot be used; None where it can. Found out and said
-    once."""
+    """Reason why the compiler, for the operations in a folder, or Triton cannot be used; None if it can. Determined and
+    logged once."""
     if what == "C++":
         try:
             if not build.library_file(folder).is_file():

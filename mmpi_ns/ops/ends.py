@@ -1,4 +1,4 @@
-"""When a ray ends and where its depth lies: the numbers of ``cpp/ends.h``, which C++ and the page's shader read too."""
+"""Termination and depth of a ray: the numbers of ``cpp/ends.h``, which C++ and the page's shader read too."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import re
 from pathlib import Path
 
 TEXT = (Path(__file__).parent / "cpp" / "ends.h").read_text(encoding="utf-8")
-"""Lines that both C++ and GLSL understand."""
+"""Source that is valid in C++ and GLSL."""
 
 
 def numbers_in(text: str, *names: str) -> list[float]:
-    """Numbers of such a header."""
+    """Values of named constants in such a header."""
     numbers = dict(re.findall(r"^const float (\w+) = ([-.\de]+);", text, re.MULTILINE))
     return [float(numbers[name]) for name in names]
 

@@ -1,6 +1,6 @@
-"""Plan data of the Triton kernels, and the functions they share. The counterpart of ``cpp/scene.h``.
+"""Plan data and shared functions of the Triton kernels, the counterpart of ``cpp/scene.h``.
 
-Imported only where Triton is wanted (``dispatch.py``): the package runs without it.
+Imported only if Triton is used (``dispatch.py``): the package runs without it.
 """
 
 # Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
@@ -21,16 +21,16 @@ from mmpi_ns.scene.texels import BRICK
 # Columns of an MPI's row in ``SceneLayout.constants``.
 ORIGIN, AXES, EXTENT, STEP, END, LAST = map(tl.constexpr, (0, 3, 12, 16, 17, 18))
 SHARE, S_SCALE, U0, U_SCALE, V0, V_SCALE, INTERVAL, FLOATS = map(tl.constexpr, range(19, 27))
-# Columns of a head's layout. BRICK_OF_TILE and TILE_OF_BRICK say where in the same tensor the brick of the head's first
-# tile, and the tile of the first brick of all, are.
+# Columns of a head's layout. BRICK_OF_TILE and TILE_OF_BRICK are the places, in the same tensor, of the brick of the
+# head's first tile and of the tile of the very first brick.
 FIRST_TILE, DEPTH, HEIGHT, WIDTH, BIAS, DOWN, ACROSS = map(tl.constexpr, range(7))
 BRICK_OF_TILE, TILE_OF_BRICK, INTS = map(tl.constexpr, range(7, 10))
 STORED = tl.constexpr(BRICK)
-"""A row found by ``row_of`` is stored from here on."""
+"""First row of a stored brick, for the results of ``row_of``."""
 
 
 def grids_of(layout: SceneLayout) -> Int[Tensor, "N"]:
-    """Where the texels of every head are, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
+    """Addresses of the texels of every head, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
     brick of every tile and the tile of every brick."""
     if "gpu" in layout.packed:
         return layout.packed["gpu"]
@@ -46,14 +46,14 @@ def grids_of(layout: SceneLayout) -> Int[Tensor, "N"]:
 
 
 def block_size(size: int, device: torch.device) -> int:
-    """Rays or rows of a program. The interpreter runs programs one after the other, so it should have few."""
+    """Rays or rows per program; more in the interpreter, which runs programs one after the other."""
     return size if device.type == "cuda" else 16 * size
 
 
 def launch(kernel: Any, size: int, block: int, *arguments: Any, **constants: Any) -> None:
-    """Runs a kernel for ``size`` items, ``block`` a program, on the device of its tensors; not at all for none."""
+    """Runs a kernel for ``size`` items, ``block`` per program, on the device of its tensors; nothing for no items."""
     if size:
-        # Triton launches on the current device, which is not that of the tensors where a process trains on another GPU.
+        # Triton launches on the current device, which may not be that of the tensors.
         with torch.cuda.device_of(next(x for x in arguments if isinstance(x, Tensor))):
             kernel[(triton.cdiv(size, block),)](*arguments, **constants)
 
@@ -63,7 +63,7 @@ def launch(kernel: Any, size: int, block: int, *arguments: Any, **constants: Any
 
 @triton.jit
 def row_of(grids, head, plane, y, x, mask):
-    """Row of a head's texel in the pooled tables: with ``texel_of``, all that knows how texels are stored.
+    """Row of a head's texel in the pooled tables. Only this and ``texel_of`` depend on how texels are stored.
 
     Where masked, plane, y and x may be out of range, and so may the row.
     """
@@ -157,7 +157,7 @@ def softplus(x):
 
 @triton.jit
 def one_minus_exp(tau):
-    """1 - e^-tau for tau >= 0, also of thin samples."""
+    """1 - e^-tau for tau >= 0, exact also for small tau."""
     t = tl.minimum(tau, 0.5)
     p = 1 - t * (1.0 / 8)
     p = 1 - t * (1.0 / 7) * p

@@ -21,7 +21,7 @@ from mmpi_ns.scene.texels import BRICK, TexelGrid
 
 
 class Tables(NamedTuple):
-    """The pooled tables that a ray is marched through, of T rows."""
+    """The pooled tables of T rows that rays are marched through."""
 
     density: Float[Tensor, "T 1"]
     """Raw densities."""
@@ -35,7 +35,7 @@ class Places(NamedTuple):
 
     heads: Int[Tensor, "R S"]
     planes: Int[Tensor, "R S"]
-    """Meaningless in the cube."""
+    """Undefined in the cube."""
     ndc: Float[Tensor, "R S 3"]
     """Position in the head."""
     valid: Bool[Tensor, "R S"]
@@ -51,7 +51,7 @@ class SceneLayout:
     grids: list[TexelGrid]
     """Texels of all heads."""
     biases: list[Float[Tensor, "L"]]
-    """Of the raw densities of each MPI's planes."""
+    """Biases of the raw densities of each MPI's planes."""
     depth_scale: float = 1.0
     """Factor on every optical depth of an MPI."""
     cube: Cube | None = None
@@ -60,8 +60,8 @@ class SceneLayout:
     content_near: float = 0.0
     """Distance to the first content."""
     packed: dict[str, Any] = field(default_factory=dict)
-    """The same in the layout of the compiled operations, made by them once. Where threads make it at once the first
-    one's stays (``setdefault``): compiled operations hold addresses in it."""
+    """The same in the layout of the compiled operations, which create it once. If threads do so at the same time, the
+    first one's stays (``setdefault``), because compiled operations hold addresses in it."""
 
     @property
     def num_heads(self) -> int:
@@ -69,12 +69,12 @@ class SceneLayout:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """What letters in shapes stand for: rows of the tables, heads and MPIs."""
+        """Sizes by the letters in shapes: rows of the tables, heads and MPIs."""
         return {"T": len(self.grids[0].places) * BRICK, "H": self.num_heads, "K": len(self.mpis)}
 
     @cached_property
     def most_samples(self) -> int:
-        """No ray has more: planes of all MPIs, and the cube's diagonal in steps."""
+        """Maximum samples of a ray: planes of all MPIs, and the cube's diagonal in steps."""
         cube, planes = self.cube, sum(m.planes for m in self.mpis)
         if cube is None:
             return planes
@@ -82,7 +82,7 @@ class SceneLayout:
 
     @cached_property
     def constants(self) -> tuple[Float[Tensor, "K 26"], Float[Tensor, "P"], Float[Tensor, "12"]]:
-        """What compiled code reads of the heads.
+        """Constants of the heads for compiled code.
 
         Of each MPI: ``frame_rows``, 1 - near / far, scale of NDC s, lower end and scale of u and of v, interval. Biases
         of all planes of all MPIs. Lower corner of the cube, extent, step between samples, bias, interval, upper corner;
@@ -114,11 +114,11 @@ class SceneLayout:
         return structs((*sizes, head_rows, self.cpu_grids, biases, cube_row, *dense_fields(tables)))
 
     def bias_starts(self) -> list[int]:
-        """Where each head's planes begin in the biases of ``constants``."""
+        """Index of each head's first plane in the biases of ``constants``."""
         return [sum(len(b) for b in self.biases[:k]) for k in range(self.num_heads)]
 
     def interval(self, k: int) -> float:
-        """Factor of head k's softplus: what a sample of it stands for."""
+        """Factor on head k's softplus: the interval that a sample represents."""
         return self.cube_interval if k >= len(self.mpis) else 256.0 / self.mpis[k].planes * self.depth_scale
 
     def optical_depth(self, k: int, raw: Float[Tensor, "N"], planes: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -136,19 +136,19 @@ def frame_rows(frames: Frames) -> Float[Tensor, "K 19"]:
 
 
 def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A tensor as compiled code reads it, which checks nothing itself: contiguous, of this shape and type."""
+    """A contiguous tensor of this shape and type, for compiled code, which checks nothing itself."""
     assert x.shape == shape and x.dtype == dtype, f"{list(x.shape)} {x.dtype} where {list(shape)} {dtype} is read"
     return x.contiguous()
 
 
 def dense(*tensors: Tensor | None, dtype: torch.dtype = torch.float32) -> list[Any]:
-    """``shaped`` for tensors whose shapes ``check_shapes`` has compared; None stays so."""
+    """``shaped`` for tensors whose shapes ``check_shapes`` has compared; None for None."""
     assert all(x is None or x.dtype == dtype for x in tensors), f"not all are {dtype}, which is read"
     return [x if x is None else x.contiguous() for x in tensors]
 
 
 def dense_fields(values: Any) -> list[Any]:
-    """``dense`` for the tensors of a named tuple, each of the type that it is annotated with."""
+    """``dense`` for the tensors of a named tuple, each of its annotated type."""
     forms = annotated(type(values))
     return [x for name, value in values._asdict().items() for x in dense(value, dtype=forms[name][1])]
 
@@ -156,16 +156,16 @@ def dense_fields(values: Any) -> list[Any]:
 def check_shapes(owner: Callable[..., Any], values: Mapping[str, Any], sizes: dict[str, int] | None = None) -> None:
     """Compares tensors with their annotations: a letter stands for one size wherever it occurs.
 
-    This is the border to C++ and Triton, which read and write memory by shapes and check nothing. Tensors within named
-    tuples are compared too; those of each dataclass in a list have letters of their own.
+    C++ and Triton read and write memory by shapes and check nothing. Tensors within named tuples are compared too; each
+    dataclass in a list has its own letters.
 
     Args:
         owner: a function or class with annotations such as ``Float[Tensor, "R S 3"]``.
-        values: its arguments or fields by name. What has ``sizes`` (a layout, a baked scene) sets letters first.
-        sizes: letters that are set already; others are added.
+        values: its arguments or fields by name. Those with ``sizes`` (a layout, a baked scene) set letters first.
+        sizes: letters that are already set; others are added.
 
     Raises:
-        ValueError: a tensor has another shape (names it).
+        ValueError: a tensor has another shape; the message names it.
     """
     letters = {} if sizes is None else sizes
     for value in values.values():
@@ -188,8 +188,7 @@ def check_shapes(owner: Callable[..., Any], values: Mapping[str, Any], sizes: di
 
 @functools.cache
 def annotated(owner: Callable[..., Any]) -> dict[str, tuple[tuple[str | int, ...], torch.dtype]]:
-    """Sizes of the tensors of an owner by name, and the type that compiled code reads; those of any shape are left
-    out."""
+    """Sizes of the tensors of an owner by name, and their types in compiled code; without those of any shape."""
     forms = {}
     for name, hint in get_type_hints(owner).items():
         arrays = [part for part in (hint, *get_args(hint)) if isinstance(getattr(part, "dim_str", None), str)]

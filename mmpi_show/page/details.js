@@ -88,16 +88,16 @@ class Details {
 
   // Uniforms and textures of a picture, for the program in use; none where it shows the field alone.
   bind(uniform, unit, camera) {
-    const { gl } = this, shown = camera ? this.chosen(camera).filter(({ view }) => this.layers.includes(view)) : [];
-    const four = (name, f) => { if (shown.length) gl.uniform4fv(uniform(name), shown.flatMap(f)); };
-    gl.uniform1i(uniform("seen"), shown.length);
+    const { gl } = this, selected = camera ? this.chosen(camera).filter(({ view }) => this.layers.includes(view)) : [];
+    const four = (name, f) => { if (selected.length) gl.uniform4fv(uniform(name), selected.flatMap(f)); };
+    gl.uniform1i(uniform("seen"), selected.length);
     gl.uniform1f(uniform("seenStep"), this.step);
     four("seenImage", ({ view, share }) => [...view.size, this.layers.indexOf(view), share]);
     four("seenEye", ({ view }) => [...view.eye, view.most]);
     four("seenLens", ({ view }) => view.camera.slice(12, 16));
     four("seenBend", ({ view }) => view.camera.slice(16, 20));
     four("seenRest", ({ view }) => view.camera.slice(20, 24));
-    if (shown.length) gl.uniformMatrix3fv(uniform("seenTurn"), false, shown.flatMap(({ view }) => view.turn));
+    if (selected.length) gl.uniformMatrix3fv(uniform("seenTurn"), false, selected.flatMap(({ view }) => view.turn));
     ["differences", "depths"].forEach((name, i) => {
       gl.activeTexture(gl.TEXTURE0 + unit + i);
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.textures[i]);

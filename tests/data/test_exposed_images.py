@@ -63,9 +63,9 @@ def test_exposure_of_an_image_without_calibration_is_that_of_what_it_shows(manag
     outputs = dict(zip(("depth", "accumulation"), images, strict=True))
     gains = manager.priors.gains.factors, manager.priors.gains.falloff
     given = *map(torch.from_numpy, gains), camera, data["image"]
-    found = manager.maker.exposure_of(manager.observations, *given, outputs)
+    actual = manager.maker.exposure_of(manager.observations, *given, outputs)
     truth = FACTORS[TEST[0]] / np.exp(np.log(FACTORS[list(TRAIN)]).mean(0))
-    np.testing.assert_allclose(found, truth, rtol=0.06)
+    np.testing.assert_allclose(actual, truth, rtol=0.06)
     nothing = outputs | {"accumulation": torch.zeros(HEIGHT, WIDTH, 1)}
     assert manager.maker.exposure_of(manager.observations, *given, nothing) is None
 

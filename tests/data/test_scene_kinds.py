@@ -146,13 +146,13 @@ def test_every_pixel_drawn_has_the_colour_that_its_ray_meets(capture):
     rays, batch = manager.next_train(0)
     origins, directions = (x[:64].double().numpy() for x in (rays.origins, rays.directions))
     wanted = color_of(*in_capture_frame(manager, origins, directions))
-    found = batch["image"].numpy()
+    actual = batch["image"].numpy()
     seen = batch["indices"][:, 1].numpy() >= HEIGHT // 4
     if kind is blender:
         wanted[~seen] = 1  # white behind
     if kind is transparent:
-        assert np.array_equal(found[:, 3] > 0, seen)
-    error = np.abs(found[:, :3] - wanted).max(-1)
+        assert np.array_equal(actual[:, 3] > 0, seen)
+    error = np.abs(actual[:, :3] - wanted).max(-1)
     # A pixel on the wall's very edge may fall on the other side of it.
     assert np.sort(error)[-3] < 0.02 and seen.any()
     if kind in (blender, scannet, transparent):

@@ -53,11 +53,11 @@ def test_shares_equal_the_oracle_at_every_reliability(heads, scale, dtype):
     votes = random_votes(np.random.default_rng(heads), 200, heads, scale)
     reliability = tensor(votes[0], dtype).double().numpy()  # compare with what this precision was given
     wanted = np.array([oracle.log_shares(r, c, o) for r, c, o in zip(reliability, *votes[1:], strict=True)])
-    found = torch.stack(shares_of(votes, dtype), -1).double().numpy()
+    actual = torch.stack(shares_of(votes, dtype), -1).double().numpy()
     sole = np.isneginf(wanted[:, 1])
-    assert np.array_equal(np.isneginf(found[:, 1]), sole) and np.all(found[sole, 0] == 0)
+    assert np.array_equal(np.isneginf(actual[:, 1]), sole) and np.all(actual[sole, 0] == 0)
     ulp = torch.finfo(dtype).eps * max(4.0, np.abs(reliability).max())
-    assert np.abs(found[~sole] - wanted[~sole]).max(initial=0) < 2 * ulp
+    assert np.abs(actual[~sole] - wanted[~sole]).max(initial=0) < 2 * ulp
 
 
 def test_what_uncovered_heads_hold_is_ignored():

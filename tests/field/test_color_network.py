@@ -50,9 +50,9 @@ def test_colours_and_their_gradients_equal_float64(channels, width, octaves, cou
     networks, features, *places = batch(channels, width, octaves, count)
     ndc, directions, rays = places
     given, exact, grad = features.clone().requires_grad_(), features.double().requires_grad_(), normal(count, 3, seed=4)
-    found, wanted = networks.shade(1, given, *places), by_formula(networks, 1, exact, ndc, directions, rays, octaves)
-    assert found.shape == (count, 3) and torch.allclose(found.double(), wanted, atol=2e-6)
-    sums = [(found * grad).sum(), (wanted * grad).sum()]
+    actual, wanted = networks.shade(1, given, *places), by_formula(networks, 1, exact, ndc, directions, rays, octaves)
+    assert actual.shape == (count, 3) and torch.allclose(actual.double(), wanted, atol=2e-6)
+    sums = [(actual * grad).sum(), (wanted * grad).sum()]
     mine = torch.autograd.grad(sums[0], [given, networks.weights])
     truth = torch.autograd.grad(sums[1], [exact, networks.weights])
     for a, b in zip(mine, truth, strict=True):

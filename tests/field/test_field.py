@@ -32,11 +32,11 @@ def block(field, k, table="features"):
 
 @pytest.mark.parametrize("planes", [2, 16, 64, 256])
 def test_every_plane_starts_with_an_equal_share_of_a_ray_that_crosses_all(planes):
-    found = render(MMPIField(one_mpi(planes=planes)).eval(), bundle([[0, 0, 0]], [[0.1, 0.2, 0.97]]))
-    assert found.samples.valid.shape == (1, planes)
+    actual = render(MMPIField(one_mpi(planes=planes)).eval(), bundle([[0, 0, 0]], [[0.1, 0.2, 0.97]]))
+    assert actual.samples.valid.shape == (1, planes)
     # The last plane is not quite opaque: all that reaches it is 1/L, of which it takes 99.9 %.
-    assert torch.allclose(found.composite.weights, torch.tensor(1 / planes), rtol=2e-3)
-    assert found.composite.transmittance.item() == pytest.approx(0.001 / planes, rel=0.05)
+    assert torch.allclose(actual.composite.weights, torch.tensor(1 / planes), rtol=2e-3)
+    assert actual.composite.transmittance.item() == pytest.approx(0.001 / planes, rel=0.05)
 
 
 def test_mpis_that_train_jointly_start_with_a_share_of_the_depth_each():
@@ -54,9 +54,9 @@ def test_a_sample_of_the_cube_starts_with_the_alpha_asked_for_at_any_sampling_ra
     cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 4.0), (9, 9, 9))
     plan = ScenePlan((make_mpi(axes=((-1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0))),), cube, 0.05, 1.0)
     field = MMPIField(plan, cube_alpha=alpha, samples_per_voxel=per_voxel).eval()
-    found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]))
-    assert found.samples.num_intersected.item() == 8 * per_voxel  # 2 units of length, 8 voxel sides
-    assert found.composite.transmittance.item() == pytest.approx((1 - alpha) ** (8 * per_voxel), rel=1e-5)
+    actual = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]))
+    assert actual.samples.num_intersected.item() == 8 * per_voxel  # 2 units of length, 8 voxel sides
+    assert actual.composite.transmittance.item() == pytest.approx((1 - alpha) ** (8 * per_voxel), rel=1e-5)
 
 
 def test_colours_start_gray_and_equal_in_every_head(plan):
@@ -120,9 +120,9 @@ def test_released_texels_are_empty_and_the_others_stay_as_they_are(plan):
     assert torch.equal(field.density[~untouched], before[~untouched])
     field.touched.fill_(0)
     field.release_untouched()
-    found = render(field, bundle(*random_rays(plan, 20, seed=0)))
-    assert found.samples.num_intersected.max() > 8
-    assert found.composite.weights.max() < 1e-6 and found.composite.transmittance.min() > 0.9999
+    actual = render(field, bundle(*random_rays(plan, 20, seed=0)))
+    assert actual.samples.num_intersected.max() > 8
+    assert actual.composite.weights.max() < 1e-6 and actual.composite.transmittance.min() > 0.9999
 
 
 def test_a_head_votes_inside_its_frustum_where_it_was_trained_and_a_sample_counts_its_own_head_always(plan):
@@ -227,9 +227,9 @@ def test_total_variation_is_the_sum_over_touched_texels_and_their_neighbours(wit
                             wanted += weight * scale * (gap**2 / 2 if gap <= 1 else gap - 0.5)
                     gap = float(field.density[row, 0] - field.density[neighbour, 0])
                     gradient[row] += 2.0 * scale * min(max(gap, -1), 1)
-    found = field.total_variation(lookup, 2.0, 0.5)
-    assert 0 < len(touched) < size and found.item() == pytest.approx(wanted, rel=1e-4)
-    found.backward()
+    actual = field.total_variation(lookup, 2.0, 0.5)
+    assert 0 < len(touched) < size and actual.item() == pytest.approx(wanted, rel=1e-4)
+    actual.backward()
     assert np.allclose(dense_grad(field.density)[:, 0].numpy(), gradient, atol=1e-6)
 
 

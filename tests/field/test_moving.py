@@ -34,8 +34,8 @@ def by_differences(field, origin, direction, near=0.05):
             met = [(s.head, s.plane) for head in ray.heads for s in head]
             if ray.margin < CLOSE or met != (samples or met):
                 return None
-            samples, found = met, ray.render()
-            values.append(MIX[:3] @ found.color + MIX[3] * found.transmittance)
+            samples, actual = met, ray.render()
+            values.append(MIX[:3] @ actual.color + MIX[3] * actual.transmittance)
         slopes.append((values[1] - values[0]) / (2 * STEP))
     return np.array(slopes)
 
@@ -43,9 +43,9 @@ def by_differences(field, origin, direction, near=0.05):
 def by_autograd(field, rays):
     """The same [R, 6] by the fast path."""
     o, d = rays.origins.requires_grad_(), rays.directions.requires_grad_()
-    found = render_rays(rays, field, MarchOptions(0.0))
+    actual = render_rays(rays, field, MarchOptions(0.0))
     mix = torch.tensor(MIX).to(o)
-    total = (found.rgb @ mix[:3] + mix[3] * found.composite.transmittance[:, 0]).sum()
+    total = (actual.rgb @ mix[:3] + mix[3] * actual.composite.transmittance[:, 0]).sum()
     grads = torch.autograd.grad(total + 0 * (o + d).sum(), (o, d))  # also where no ray meets anything
     return torch.cat(grads, -1).double().numpy()
 
@@ -53,9 +53,9 @@ def by_autograd(field, rays):
 def compare(field, origins, directions, near=0.05):
     """How many rays had derivatives to compare with, of the size of their colours or so."""
     origins, directions = np.atleast_2d(origins), np.atleast_2d(directions)
-    found, compared = by_autograd(field, bundle(origins, directions, near)), 0
-    assert np.isfinite(found).all()
-    for mine, origin, direction in zip(found, origins, directions, strict=True):
+    actual, compared = by_autograd(field, bundle(origins, directions, near)), 0
+    assert np.isfinite(actual).all()
+    for mine, origin, direction in zip(actual, origins, directions, strict=True):
         wanted = by_differences(field, np.float64(origin), np.float64(direction), near)
         if wanted is not None:
             assert np.abs(mine - wanted).max() < 5e-5 * (0.1 + np.abs(wanted).max())
@@ -97,30 +97,30 @@ def test_rays_along_the_planes_or_away_have_no_gradient():
 
 
 def test_a_ray_nearly_along_the_planes_has_finite_gradients():
-    found = by_autograd(one_mpi(), bundle([[0, 0, 0]], [unit([1.9, 0.3, 1.0])]))
-    assert np.isfinite(found).all() and np.isfinite(by_autograd(one_mpi(), bundle([[0, 0, 0]], [[1, 0, 2e-6]]))).all()
+    actual = by_autograd(one_mpi(), bundle([[0, 0, 0]], [unit([1.9, 0.3, 1.0])]))
+    assert np.isfinite(actual).all() and np.isfinite(by_autograd(one_mpi(), bundle([[0, 0, 0]], [[1, 0, 2e-6]]))).all()
 
 
 def test_the_plane_at_infinity_moves_with_the_direction_alone():
     origin, direction = [0.13, 0.07, 5.0], unit([0.2, 0.1, 1.0])  # behind every plane but the last
     assert compare(one_mpi(), origin, direction) == 1
-    found = by_autograd(one_mpi(), bundle([origin], [direction]))
-    assert not found[0, :3].any() and np.abs(found[0, 3:]).max() > 0.01
+    actual = by_autograd(one_mpi(), bundle([origin], [direction]))
+    assert not actual[0, :3].any() and np.abs(actual[0, 3:]).max() > 0.01
     finite = by_autograd(one_mpi(far=20.0), bundle([origin], [direction]))
     assert np.abs(finite[0, :3]).max() > 1e-4
 
 
 @pytest.mark.parametrize("trains", [True, False])
 def test_rays_shaded_once_have_the_gradients_of_float64_also_through_a_frozen_field(trains):
-    plan, found = random_plan(2, True, 0), []
+    plan, actual = random_plan(2, True, 0), []
     for dtype in (torch.float32, torch.float64):
         field = fill(MMPIField(plan, shading="ray", feature_channels=7, hidden_width=6), 0).to(dtype)
         field.requires_grad_(trains)
         rays = bundle(*random_rays(plan, 30, seed=5))
         for name in ("origins", "directions", "nears", "fars"):
             setattr(rays, name, getattr(rays, name).to(dtype))
-        found.append(by_autograd(field, rays))
-    assert np.abs(found[1]).max() > 0.1 and np.abs(found[0] - found[1]).max() < 1e-4 * np.abs(found[1]).max()
+        actual.append(by_autograd(field, rays))
+    assert np.abs(actual[1]).max() > 0.1 and np.abs(actual[0] - actual[1]).max() < 1e-4 * np.abs(actual[1]).max()
 
 
 def test_samples_stay_where_they_are_to_the_bit_and_rays_that_do_not_move_cost_nothing():

@@ -24,7 +24,7 @@ def ray_field(num_mpis=3, with_cube=True, seed=0, channels=7, **chosen):
     return fill(field, seed)
 
 
-def shown(field, rays, gradients=False, chosen=None):
+def rendered(field, rays, gradients=False, chosen=None):
     """What the field's rays show, by the ways of training or of rendering."""
     with torch.set_grad_enabled(gradients):
         _, samples = sampled(field, rays)
@@ -61,7 +61,7 @@ def raw_texels(monkeypatch):
 def test_a_ray_shows_what_loops_in_float64_say(raw_texels, gradients, num_mpis, with_cube):
     field = ray_field(num_mpis, with_cube)
     origins, directions = random_rays(field.plan, 40, seed=3)
-    colors, made = shown(field, bundle(origins, directions), gradients)
+    colors, made = rendered(field, bundle(origins, directions), gradients)
     met = 0
     for i, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
         ray = OracleRay(field, origin, direction)
@@ -77,8 +77,8 @@ def test_a_ray_shows_what_loops_in_float64_say(raw_texels, gradients, num_mpis, 
             first, second = first + weight * texel[:3], second + weight * texel[:3] ** 2
         wanted = (1 - passed) * shaded_by_hand(field.networks, gathered / mass, direction)
         assert np.abs(colors.rgb[i].detach().numpy() - wanted).max() < ERROR
-        for found, value in ((colors.mass, mass), (colors.first, first), (colors.second, second)):
-            assert np.abs(found[i].detach().numpy() - value).max() < ERROR
+        for actual, value in ((colors.mass, mass), (colors.first, first), (colors.second, second)):
+            assert np.abs(actual[i].detach().numpy() - value).max() < ERROR
         met += 1
     assert met > 20 and made.accumulation.max() > 0.5
 
@@ -86,14 +86,14 @@ def test_a_ray_shows_what_loops_in_float64_say(raw_texels, gradients, num_mpis, 
 def test_rendering_shows_what_training_does():
     field = ray_field()
     rays = bundle(*random_rays(field.plan, 50, seed=4))
-    a, b = shown(field, rays)[0].rgb, shown(field, rays, gradients=True)[0].rgb.detach()
+    a, b = rendered(field, rays)[0].rgb, rendered(field, rays, gradients=True)[0].rgb.detach()
     assert (a - b).abs().max() < 3e-6 and a.std() > 0.05
 
 
 @pytest.mark.parametrize("path", ["auto", "torch"])
 def test_gradients_of_texels_densities_and_network_are_those_of_float64(path):
     rays, upstream = bundle(*random_rays(random_plan(3, True, 0), 30, seed=5)), torch.linspace(-1, 1, 90).view(30, 3)
-    found = []
+    actual = []
     for dtype in (torch.float32, F64):
         dispatch.choose(path)
         try:
@@ -102,14 +102,14 @@ def test_gradients_of_texels_densities_and_network_are_those_of_float64(path):
                 rays = bundle(*random_rays(field.plan, 30, seed=5))
                 for name in ("origins", "directions", "nears", "fars"):
                     setattr(rays, name, getattr(rays, name).double())
-            colors, _ = shown(field, rays, gradients=True)
+            colors, _ = rendered(field, rays, gradients=True)
             loss = (colors.rgb * upstream).sum() + (colors.first * upstream).sum() + (colors.second * upstream).sum()
             loss.backward()
         finally:
             dispatch.choose("auto")
         tables = (field.density, field.features, field.networks.weights)
-        found.append([p.grad.double() for p in tables])
-    for a, b in zip(*found, strict=True):
+        actual.append([p.grad.double() for p in tables])
+    for a, b in zip(*actual, strict=True):
         assert b.abs().max() > 0.01 and (a - b).abs().max() < 1e-4 * b.abs().max()
 
 
@@ -117,8 +117,8 @@ def test_gradients_of_texels_densities_and_network_are_those_of_float64(path):
 def test_rays_that_are_not_chosen_learn_no_colour(shading):
     field = ray_field() if shading == "ray" else random_field(3, with_cube=True)
     rays, chosen = bundle(*random_rays(field.plan, 20, seed=6)), torch.arange(20) % 2 == 0
-    colors, _ = shown(field, rays, gradients=True, chosen=chosen)
-    everything, _ = shown(field, rays, gradients=True)
+    colors, _ = rendered(field, rays, gradients=True, chosen=chosen)
+    everything, _ = rendered(field, rays, gradients=True)
     assert torch.allclose(colors.rgb[chosen], everything.rgb[chosen], rtol=0, atol=0 if shading == "ray" else 1e-6)
     assert not colors.first[~chosen].any()
     (colors.first[~chosen].sum() + colors.second[~chosen].sum()).backward()
@@ -128,7 +128,7 @@ def test_rays_that_are_not_chosen_learn_no_colour(shading):
 def test_a_fresh_network_shows_the_diffuse_colour():
     field = ray_field()
     field.networks.resize(1)
-    colors, made = shown(field, bundle(*random_rays(field.plan, 20, seed=6)))
+    colors, made = rendered(field, bundle(*random_rays(field.plan, 20, seed=6)))
     diffuse = colors.first / colors.mass.clamp(min=1e-6) * made.accumulation
     assert torch.allclose(colors.rgb, diffuse, atol=1e-6) and len(field.networks.weights) == 1
 

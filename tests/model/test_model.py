@@ -84,9 +84,9 @@ def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_
         samples = run_step(trainer, step)[0].samples
         return [tuple(sorted(set(h[v].tolist()) - {2})) for h, v in zip(samples.heads, samples.valid, strict=True)]
 
-    found = heads_of_rays(0)
-    assert len(found) == 80 and set(found) == {(0,), (1,)}
-    assert 20 < found.count((0,)) < 60 and found == heads_of_rays(0) and found != heads_of_rays(1)
+    actual = heads_of_rays(0)
+    assert len(actual) == 80 and set(actual) == {(0,), (1,)}
+    assert 20 < actual.count((0,)) < 60 and actual == heads_of_rays(0) and actual != heads_of_rays(1)
     blend = trainer.pipeline.model.progress.schedule.phases[1].start
     assert set(heads_of_rays(blend)) == {(0, 1)}
 
@@ -221,8 +221,8 @@ def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
     read = trainer_of(scene, other, tmp_path, steps=8, training=training).pipeline.model.eval()
     read.load_state_dict(trained.state_dict())
     for name in ("rgb", "accumulation", "depth"):
-        expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
-        assert torch.equal(expected, found), name
+        expected, actual = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
+        assert torch.equal(expected, actual), name
     assert read.show.options == ["all", *trained.field.full_plan.names]
     assert read.field.blends == trained.field.blends
 

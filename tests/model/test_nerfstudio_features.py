@@ -79,9 +79,9 @@ def test_render_follows_a_spiral(run, ffmpeg, tmp_path):
         seconds=1,
         frame_rate=4,
     ).main()
-    found = [np.asarray(Image.open(f), float) / 255 for f in sorted((tmp_path / "out").glob("*.png"))]
-    assert len(found) == 4 and all(f.shape == (HEIGHT, WIDTH, 3) for f in found)
-    assert all(f.std() > 0.05 for f in found) and np.abs(found[0] - found[1]).max() > 0.02
+    actual = [np.asarray(Image.open(f), float) / 255 for f in sorted((tmp_path / "out").glob("*.png"))]
+    assert len(actual) == 4 and all(f.shape == (HEIGHT, WIDTH, 3) for f in actual)
+    assert all(f.std() > 0.05 for f in actual) and np.abs(actual[0] - actual[1]).max() > 0.02
 
 
 def test_points_for_export_lie_on_the_wall(run, monkeypatch, capsys):
@@ -124,8 +124,8 @@ class Browser:
         """The next message that fits."""
         while True:
             if not self.received:
-                found = msgspec.msgpack.decode(self.socket.recv(timeout=timeout))
-                self.received = [found] if isinstance(found, dict) else list(found)
+                actual = msgspec.msgpack.decode(self.socket.recv(timeout=timeout))
+                self.received = [actual] if isinstance(actual, dict) else list(actual)
             while self.received:
                 message = self.received.pop(0)
                 if accept(message):
@@ -150,13 +150,13 @@ class Browser:
 
     def settled(self):
         """The last picture [H, W, 3] of those that come, coarse ones first, until none comes for three seconds."""
-        found, timeout = None, 20
+        actual, timeout = None, 20
         while True:
             try:
-                found = self.wait_for(lambda m: m["type"] == "BackgroundImageMessage", timeout)
+                actual = self.wait_for(lambda m: m["type"] == "BackgroundImageMessage", timeout)
                 timeout = 3  # on a busy machine the fine one takes more than a second
             except TimeoutError:
-                return np.asarray(Image.open(io.BytesIO(found["rgb_bytes"])).convert("RGB"), float) / 255
+                return np.asarray(Image.open(io.BytesIO(actual["rgb_bytes"])).convert("RGB"), float) / 255
 
 
 @pytest.fixture

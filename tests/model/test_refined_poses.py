@@ -60,8 +60,8 @@ def test_poses_move_in_every_phase_but_that_of_reliability(whole):
 def test_a_resumed_run_refines_as_the_uninterrupted_one(whole, scene, plan_file, tmp_path, step):
     trainer = ready(refining(scene, plan_file, tmp_path), load_dir=whole.checkpoint_dir, load_step=step)
     trainer.train()
-    wanted, found = (load(t.checkpoint_dir, STEPS - 1) for t in (whole, trainer))
-    assert differences(compared(wanted), compared(found)) == []
+    wanted, actual = (load(t.checkpoint_dir, STEPS - 1) for t in (whole, trainer))
+    assert differences(compared(wanted), compared(actual)) == []
 
 
 @pytest.mark.parametrize("refines", [False, True])
@@ -86,12 +86,12 @@ def test_exported_cameras_are_the_given_ones_with_their_corrections(whole, monke
 
     _, pipeline, _, _ = eval_setup(whole.base_dir / "config.yml")
     frames, tests = collect_camera_poses(pipeline)
-    found = torch.tensor([frame["transform"] for frame in frames])
+    actual = torch.tensor([frame["transform"] for frame in frames])
     given = whole.pipeline.datamanager.train_dataset.cameras.camera_to_worlds
     moves = exp_map_SO3xR3(corrections(whole.checkpoint_dir, STEPS - 1))
-    assert torch.allclose(found[:, :, :3], moves[:, :, :3] @ given[:, :, :3], atol=1e-6)
-    assert torch.allclose(found[:, :, 3], moves[:, :, 3] + given[:, :, 3], atol=1e-6)
-    assert (found - given).abs().max() > 1e-4 and len(tests) == 2
+    assert torch.allclose(actual[:, :, :3], moves[:, :, :3] @ given[:, :, :3], atol=1e-6)
+    assert torch.allclose(actual[:, :, 3], moves[:, :, 3] + given[:, :, 3], atol=1e-6)
+    assert (actual - given).abs().max() > 1e-4 and len(tests) == 2
     names = [str(name) for name in whole.pipeline.datamanager.train_dataset.image_filenames]
     assert [frame["file_path"] for frame in frames] == names
 

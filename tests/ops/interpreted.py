@@ -34,8 +34,8 @@ from mmpi_ns.scene.texels import BRICK
 @pytest.mark.parametrize("shapes", [Shapes(), Shapes((1, 9), cube=False, channels=9)], ids=["2 MPIs", "1 and 9 MPIs"])
 @pytest.mark.parametrize("name", sorted(CASES.keys() - {"adam_rows", "march", "render_fused"}))
 def test_kernels_and_their_gradients_are_those_of_the_definitions(name, shapes):
-    found = differences(name, "cpu", shapes)
-    assert found and max(found) < CLOSE
+    actual = differences(name, "cpu", shapes)
+    assert actual and max(actual) < CLOSE
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -64,15 +64,15 @@ def test_distinct_rows_are_those_of_the_reference(count, spread):
     anywhere = torch.randint(0, most, (different,), generator=g)
     anywhere[0] = most - 1
     rows = {"side by side": chosen, "anywhere": anywhere[chosen], "one": chosen * 0}[spread]
-    found = interpolate.index_rows(rows, most)
-    assert torch.equal(found.unique, rows.unique())
-    assert found.positions.shape == rows.shape and torch.equal(found.unique[found.positions.long()], rows)
+    actual = interpolate.index_rows(rows, most)
+    assert torch.equal(actual.unique, rows.unique())
+    assert actual.positions.shape == rows.shape and torch.equal(actual.unique[actual.positions.long()], rows)
 
 
 def test_padded_rows_end_in_row_0_which_nothing_is_added_to():
     rows = torch.tensor([[7, 3], [3, 90], [7, 7]])
-    found = interpolate.index_rows(rows, 100, pads=True)
-    assert found.unique.tolist() == [3, 7, 90, 0, 0, 0] and torch.equal(found.unique[found.positions.long()], rows)
+    actual = interpolate.index_rows(rows, 100, pads=True)
+    assert actual.unique.tolist() == [3, 7, 90, 0, 0, 0] and torch.equal(actual.unique[actual.positions.long()], rows)
     table = Table(normal(100, 1))
     interpolate.interpolate(table, rows, torch.ones(3, 2)).sum().backward()
     assert torch.equal(dense_grad(table)[:, 0], torch.bincount(rows.reshape(-1), minlength=100).float())
@@ -80,9 +80,9 @@ def test_padded_rows_end_in_row_0_which_nothing_is_added_to():
 
 @pytest.mark.parametrize("pads", [False, True])
 def test_no_rows_are_no_distinct_rows(pads):
-    found = interpolate.index_rows(torch.zeros(0, 4, dtype=torch.int64), 9, pads)
-    assert found.unique.shape == (0,) and found.positions.shape == (0, 4)
-    assert interpolate.sum_rows(found.positions, torch.zeros(0, 3), torch.zeros(0, 4), 0).shape == (0, 3)
+    actual = interpolate.index_rows(torch.zeros(0, 4, dtype=torch.int64), 9, pads)
+    assert actual.unique.shape == (0,) and actual.positions.shape == (0, 4)
+    assert interpolate.sum_rows(actual.positions, torch.zeros(0, 3), torch.zeros(0, 4), 0).shape == (0, 3)
 
 
 @pytest.mark.parametrize("channels", [9])
@@ -132,11 +132,11 @@ def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monke
     rays = hard_rays()
     for blends, threshold in ((False, 0.0), (False, 1e-3), (True, 1e-3)):
         fast, _ = compare(field.eval(), rays, threshold, blends)
-        found = {n: x for n, x in vars(fast.samples).items() if isinstance(x, torch.Tensor)}
-        tensors = [fast.rgb, fast.composite.weights, *found.values()]
+        actual = {n: x for n, x in vars(fast.samples).items() if isinstance(x, torch.Tensor)}
+        tensors = [fast.rgb, fast.composite.weights, *actual.values()]
         assert all(torch.isfinite(t.float()).all() for t in tensors)
     names = list(HARD_RAYS)
-    heads = found["heads"][names.index("on the axis")][found["valid"][names.index("on the axis")]]
+    heads = actual["heads"][names.index("on the axis")][actual["valid"][names.index("on the axis")]]
     assert raw != 0 or (heads == 1).any(), "equal distances: the twin's samples follow the first MPI's"
     assert (
         fast.samples.num_intersected[names.index("along the planes")] == 0

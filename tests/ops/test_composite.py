@@ -89,13 +89,13 @@ def weights_and_gradient(function, given, dtype):
 @pytest.mark.parametrize("slots", [1, 16, 37])
 def test_weights_and_their_gradient_equal_float64(slots):
     given = batch(slots=slots)
-    found = weights_and_gradient(composite_weights, given, torch.float32)
+    actual = weights_and_gradient(composite_weights, given, torch.float32)
     wanted = weights_and_gradient(composite_weights.reference, given, torch.float64)
-    for a, b in zip(found, wanted, strict=True):
+    for a, b in zip(actual, wanted, strict=True):
         assert ((a.double() - b).abs() <= 3e-6 * (1 + b.abs().amax(-1, keepdim=True))).all()
-    assert (found[0][~given[1]] == 0).all() and (found[3][~given[1]] == 0).all()
+    assert (actual[0][~given[1]] == 0).all() and (actual[3][~given[1]] == 0).all()
     thin = (given[0] < 1e-4) & (wanted[0] > 0.5 * given[0]) & (given[0] > 0)
-    assert thin.any() and ((found[0].double() - wanted[0]).abs()[thin] <= 1e-5 * wanted[0][thin]).all()
+    assert thin.any() and ((actual[0].double() - wanted[0]).abs()[thin] <= 1e-5 * wanted[0][thin]).all()
 
 
 def test_opaque_and_infinite_samples_hide_what_lies_behind():
@@ -118,12 +118,12 @@ def test_a_depth_that_is_not_a_number_is_not_hidden():
 def test_colours_of_rays_and_their_gradients_equal_float64():
     given, g = batch(), torch.Generator().manual_seed(2)
     colors, upstream = torch.rand(60, 37, 3, generator=g), torch.randn(60, 3, generator=g)
-    found = []
+    actual = []
     for dtype in (torch.float32, torch.float64):
         made = composite_weights.reference(*(x.to(dtype) if x.is_floating_point() else x for x in given))
         weights, own = made.weights.requires_grad_(), colors.detach().to(dtype).requires_grad_()
         rgb = render_colors(Composite(weights, made.accumulation, made.transmittance), own)
         (rgb * upstream).sum().backward()
-        found.append((rgb.detach(), weights.grad, own.grad))
-    for a, b in zip(*found, strict=True):
+        actual.append((rgb.detach(), weights.grad, own.grad))
+    for a, b in zip(*actual, strict=True):
         assert b.abs().max() > 0.1 and ((a.double() - b).abs() <= 2e-5 * b.abs() + 2e-6).all()

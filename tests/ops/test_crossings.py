@@ -39,8 +39,8 @@ def found_and_wanted(mpis, origins, directions, near=0.05, far=math.inf):
     at = torch.stack([x[ray, head, 0] + w * x[ray, head, 1] for x in (wanted.u, wanted.v)], -1)
     o, d = wanted.local_origins[ray, head, 2], wanted.local_directions[ray, head, 2]
     places = torch.cat([2 * (at - low) / (high - low) - 1, inverse_distance(w, o, d)[:, None]], -1)
-    found = torch.cat([m.ndc[ray, slot, :2], m.inverse_t[ray, slot, None]], -1).double()
-    return SimpleNamespace(count=count, m_first=first, places=found), SimpleNamespace(**vars(wanted), places=places)
+    actual = torch.cat([m.ndc[ray, slot, :2], m.inverse_t[ray, slot, None]], -1).double()
+    return SimpleNamespace(count=count, m_first=first, places=actual), SimpleNamespace(**vars(wanted), places=places)
 
 
 @pytest.mark.parametrize(
@@ -58,11 +58,11 @@ def found_and_wanted(mpis, origins, directions, near=0.05, far=math.inf):
 )
 def test_hard_rays_hit_the_planes_of_the_reference(origin, direction):
     mpis = [make_mpi(planes=9), make_mpi("b", (0.2, 0.0, -1.0), planes=5)]
-    found, wanted = found_and_wanted(mpis, origin, direction)
-    assert torch.equal(found.count, wanted.count)
+    actual, wanted = found_and_wanted(mpis, origin, direction)
+    assert torch.equal(actual.count, wanted.count)
     hit = wanted.count > 0
-    assert torch.equal(found.m_first[hit], wanted.m_first[hit])
-    assert torch.allclose(found.places, wanted.places, atol=2e-6)
+    assert torch.equal(actual.m_first[hit], wanted.m_first[hit])
+    assert torch.allclose(actual.places, wanted.places, atol=2e-6)
 
 
 def test_rays_that_are_not_numbers_and_no_rays_hit_nothing():

@@ -82,8 +82,8 @@ def test_sums_are_those_of_loops(function, channels, in_cube):
         for p, s in zip(g.positions, g.weights, strict=True)
     ]
     wanted_sums = sums_by_hand(values.numpy(), samples, slots.tolist(), weights.numpy(), wanted.tolist())
-    found = function(*in_float32(given))
-    for a, b in zip(parts_of(found), wanted_sums, strict=True):
+    actual = function(*in_float32(given))
+    for a, b in zip(parts_of(actual), wanted_sums, strict=True):
         assert np.abs(a.numpy() - b).max() < 1e-6
     assert wanted_sums[1].max() > 0.5 and not wanted.all()
 
@@ -112,8 +112,8 @@ def test_reference_gradients_are_finite_differences():
         return gather_taps.reference(values, taps, slots, weights, wanted).gathered
 
     def moments(values):
-        found = gather_taps.reference(values, groups, slots, weights, wanted)
-        return found.first, found.second
+        actual = gather_taps.reference(values, groups, slots, weights, wanted)
+        return actual.first, actual.second
 
     shares = [g.weights.clone().requires_grad_() for g in groups]
     assert torch.autograd.gradcheck(sums, (values.requires_grad_(), weights.clone().requires_grad_(), *shares))
@@ -133,8 +133,8 @@ def test_at_places_sums_are_those_at_their_taps(with_cube):
     table, everything = field.features.data, torch.ones(60, dtype=torch.bool)
     taps = [Taps(lookup.rows[t.positions], t.weights.double()) for t in lookup.taps]
     exact = gather_taps.reference(table.double(), taps, lookup.index, weights.double(), everything)
-    found = gather_places(field.layout, table, places, weights)
-    for a, b in zip(parts_of(found), parts_of(exact), strict=True):
+    actual = gather_places(field.layout, table, places, weights)
+    for a, b in zip(parts_of(actual), parts_of(exact), strict=True):
         assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
     assert samples.heads.unique().numel() == 3 + with_cube
 
@@ -161,6 +161,6 @@ def test_what_is_not_a_number_stays_in_its_own_sample():
     rays = torch.zeros(7, dtype=torch.bool)
     rays[slots[hit] // 6] = True
     values[4] = torch.nan
-    found = gather_taps(values, groups, slots, weights, wanted).gathered
+    actual = gather_taps(values, groups, slots, weights, wanted).gathered
     assert rays.any() and not rays.all()
-    assert found[rays].isnan().all() and torch.equal(found[~rays], plain[~rays])
+    assert actual[rays].isnan().all() and torch.equal(actual[~rays], plain[~rays])

@@ -19,10 +19,10 @@ from mmpi_ns.ops import dispatch
 def test_kernels_by_the_interpreter():
     """The variable must be set before Triton is imported, so these tests have a process of their own."""
     file = str(HERE / "ops" / "interpreted.py")
-    found = python("-m", "pytest", "-p", "no:cacheprovider", file, TRITON_INTERPRET="1")
-    assert found.returncode == 0, found.stdout[-6000:] + found.stderr[-2000:]
-    passed = re.search(r"(\d+) passed", found.stdout)
-    assert passed and int(passed[1]) > 30 and "skipped" not in found.stdout, found.stdout[-500:]
+    actual = python("-m", "pytest", "-p", "no:cacheprovider", file, TRITON_INTERPRET="1")
+    assert actual.returncode == 0, actual.stdout[-6000:] + actual.stderr[-2000:]
+    passed = re.search(r"(\d+) passed", actual.stdout)
+    assert passed and int(passed[1]) > 30 and "skipped" not in actual.stdout, actual.stdout[-500:]
 
 
 @needs_triton
@@ -44,8 +44,8 @@ def test_kernels_compile_without_spilling_registers(monkeypatch, architecture):
 def test_kernels_on_a_gpu():
     from kernel_checks import run_checks
 
-    found = run_checks("cuda", rehearse=False)
-    assert found["failed"] == 0 and len(found["checks"]) > 30, [c for c in found["checks"] if not c["ok"]]
+    actual = run_checks("cuda", rehearse=False)
+    assert actual["failed"] == 0 and len(actual["checks"]) > 30, [c for c in actual["checks"] if not c["ok"]]
 
 
 def test_importing_the_package_imports_no_kernel():
@@ -56,8 +56,8 @@ def test_importing_the_package_imports_no_kernel():
         "import nerfstudio.configs.method_configs, mmpi_ns.training.trainer, mmpi_ns.data.datamanager\n"
         "assert not [m for m in sys.modules if m.startswith('mmpi_ns.ops') and 'gpu' in m]"
     )
-    found = python("-c", code)
-    assert found.returncode == 0, found.stderr
+    actual = python("-c", code)
+    assert actual.returncode == 0, actual.stderr
 
 
 @pytest.fixture

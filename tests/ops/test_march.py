@@ -37,14 +37,14 @@ def test_without_rays_or_samples_there_is_nothing_to_march():
 def test_results_do_not_depend_on_the_number_of_threads():
     field = random_field(4, True, seed=5, planes=40)
     rays, threads = bundle(*random_rays(field.plan, 1200, seed=6)), torch.get_num_threads()
-    found = []
+    actual = []
     for count in (1, 3):
         try:
             torch.set_num_threads(count)
-            found.append(render(field, rays, 1e-3, True))
+            actual.append(render(field, rays, 1e-3, True))
         finally:
             torch.set_num_threads(threads)
-    one, three = found
+    one, three = actual
     assert torch.equal(one.samples.dropped_mass, three.samples.dropped_mass)
     tensors = [n for n, x in vars(one.samples).items() if isinstance(x, torch.Tensor)]
     assert all(torch.equal(getattr(one.samples, n), getattr(three.samples, n)) for n in tensors)

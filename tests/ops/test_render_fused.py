@@ -88,9 +88,9 @@ def test_behind_an_opaque_plane_nothing_is_read_and_a_hundred_thousandth_is_lost
     behind = field.grids[0].rows[10 * field.grids[0].height * field.grids[0].width :]
     field.density.data[field.grids[0].rows] = 30.0
     field.density.data[behind], field.features.data[behind] = math.nan, math.nan
-    found = rendered(field, bundle([[0, 0, 0]], [[0, 0, 1]]), 1e-3)
-    assert found.accumulation.item() == pytest.approx(1, abs=1e-5) and found.gathered.isfinite().all()
-    assert 0 < found.dropped_mass.item() <= 1e-5
+    actual = rendered(field, bundle([[0, 0, 0]], [[0, 0, 1]]), 1e-3)
+    assert actual.accumulation.item() == pytest.approx(1, abs=1e-5) and actual.gathered.isfinite().all()
+    assert 0 < actual.dropped_mass.item() <= 1e-5
 
 
 def test_after_growth_and_release_rays_pass_other_tiles():

@@ -25,14 +25,14 @@ def test_variation_equals_the_reference_with_its_gradient(channels, chroma):
     texels = torch.cat([g.rows for g in grids])
     table = normal(len(grids[0].places) * 64, channels) * 2
     rows = texels[torch.randperm(plan.texels, generator=torch.Generator().manual_seed(1))[: plan.texels - 9]]
-    found, scales = [], torch.tensor([(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)])
+    actual, scales = [], torch.tensor([(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)])
     for function in (total_variation, total_variation.reference):
         values = table[rows].requires_grad_()
         value = function(values, table, rows, layout, scales, chroma)
         (3 * value).backward()
-        found.append((value.item(), values.grad))
-    assert found[0][0] == pytest.approx(found[1][0], rel=1e-5) and found[0][0] > 1
-    assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
+        actual.append((value.item(), values.grad))
+    assert actual[0][0] == pytest.approx(actual[1][0], rel=1e-5) and actual[0][0] > 1
+    assert torch.allclose(actual[0][1], actual[1][1], atol=1e-5)
 
 
 @pytest.mark.parametrize("function", [total_variation, total_variation.reference])

@@ -104,16 +104,16 @@ def share_in_no_mpi(plan, cameras, distance):
 
 
 def test_directions_are_those_of_the_lens():
-    found, _ = walk(150)
-    focal = found.intrinsics[0, 0]
+    actual, _ = walk(150)
+    focal = actual.intrinsics[0, 0]
     shares = np.random.default_rng(1).uniform(0, 1, (200, 2))
-    at = (shares - 0.5) * found.sizes[0] / focal * [1, -1]
-    wanted, got = equidistant(at), found.directions(3, shares)
+    at = (shares - 0.5) * actual.sizes[0] / focal * [1, -1]
+    wanted, got = equidistant(at), actual.directions(3, shares)
     assert np.abs(got).max(-1) == pytest.approx(1)
     assert np.abs(got / np.linalg.norm(got, axis=-1, keepdims=True) - wanted).max() < 5e-3
-    assert np.abs(found.depths(np.full(200, 3), found.centers[3] + 4 * got) - 4).max() < 1e-9
-    behind = found.centers[3] + [[0, 0, 5.0], [1.0, 0, 5.0]]
-    assert (found.depths(np.array([3, 3]), behind) < 0).all()
+    assert np.abs(actual.depths(np.full(200, 3), actual.centers[3] + 4 * got) - 4).max() < 1e-9
+    behind = actual.centers[3] + [[0, 0, 5.0], [1.0, 0, 5.0]]
+    assert (actual.depths(np.array([3, 3]), behind) < 0).all()
 
 
 def test_lenses_without_distortion_are_pinholes():
@@ -121,17 +121,17 @@ def test_lenses_without_distortion_are_pinholes():
     poses = torch.eye(4)[None, :3].repeat(2, 1, 1)
     assert lens_directions(Cameras(poses, focal, focal, 50.0, 40.0, 100, 80)) is None
     bent = Cameras(poses, focal, focal, 50.0, 40.0, 100, 80, torch.tensor([[-0.1, 0, 0, 0, 0, 0.0]]).repeat(2, 1))
-    found = lens_directions(bent)
-    assert found is not None and np.abs(found[0, 8, 8] - [0, 0, -1]).max() < 1e-6
-    assert found[0, 8, -1, 0] / -found[0, 8, -1, 2] > 0.51  # a barrel sees farther than 50 / 100
+    actual = lens_directions(bent)
+    assert actual is not None and np.abs(actual[0, 8, 8] - [0, 0, -1]).max() < 1e-6
+    assert actual[0, 8, -1, 0] / -actual[0, 8, -1, 2] > 0.51  # a barrel sees farther than 50 / 100
 
 
 @pytest.mark.parametrize("degrees", [100, 150, 178])
 def test_a_fisheyes_pixels_lie_in_mpis(degrees):
     """At the depths of the room's walls; farther away fewer are lost than if the lens were a pinhole."""
-    found, cameras = walk(degrees)
-    assert found.wide.all() and not walk(80)[0].wide.any()
-    plan, pinholes = (place(o, PlacementConfig(max_texels=4e6)) for o in (found, replace(found, lens=None)))
+    actual, cameras = walk(degrees)
+    assert actual.wide.all() and not walk(80)[0].wide.any()
+    plan, pinholes = (place(o, PlacementConfig(max_texels=4e6)) for o in (actual, replace(actual, lens=None)))
     for distance in (3.0, 4.5):
         assert share_in_no_mpi(plan, cameras, distance) < 0.01, (distance, plan.names)
     for distance in (9.0, 1e4):
@@ -141,6 +141,6 @@ def test_a_fisheyes_pixels_lie_in_mpis(degrees):
 
 def test_cameras_that_see_nothing_are_refused():
     """All pixels of a lens look the same way, as those of a panorama of whole turns between the grid's points do."""
-    found, _ = walk(150)
+    actual, _ = walk(150)
     with pytest.raises(InputError, match="No MPI fits the field of view"):
-        place(replace(found, lens=np.broadcast_to(found.lens[:, 8:9, 8:9], found.lens.shape)), PlacementConfig())
+        place(replace(actual, lens=np.broadcast_to(actual.lens[:, 8:9, 8:9], actual.lens.shape)), PlacementConfig())

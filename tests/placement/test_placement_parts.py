@@ -47,8 +47,8 @@ def test_planes_begin_a_little_before_the_content_of_the_camera_or_of_all_where_
     observations = seen_from([[0.0, 0, 0], [30, 0, 0]], [[0, 0, -d] for d in depths], np.repeat([0, 1], 40))
     visible = find_visible_points(observations)
     assert visible.near == 55
-    found = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, visible)}
-    assert found == pytest.approx({
+    actual = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, visible)}
+    assert actual == pytest.approx({
         ("view 1", 0.0): 6, ("view 1", 55.0): 61, ("view 1", 110.0): 116,
         ("view 2", 0.0): 33, ("view 2", 55.0): 88, ("view 2", 110.0): 143,
     })  # fmt: skip

@@ -143,7 +143,7 @@ def moved(frames, shift=(0.0, 0.0, 0.0), scale=1.0, about=0):
 
 def test_sound_track_is_right(sound):
     verdict = judge_alone(sound, is_sequence=True)
-    assert verdict.grade == "right" and not verdict.says
+    assert verdict.grade == "right" and not verdict.summary
     assert judge_alone(sound, is_sequence=False).grade == "right"
 
 
@@ -157,7 +157,7 @@ def test_jump_along_the_way_is_broken_though_epipolar_lines_do_not_see_it(keypoi
     assert bridges(witness.pairs, len(straight), witness.pairs.fitting).min() > 0.99
     verdict = judge_alone(witness, is_sequence=True)
     assert verdict.grade == "broken"
-    assert "between frame_011 and frame_012" in verdict.says and "usual steps" in verdict.says
+    assert "between frame_011 and frame_012" in verdict.summary and "usual steps" in verdict.summary
 
 
 def test_a_break_before_the_last_image_is_doubtful_and_believed_where_two_mappers_agree(sound):
@@ -165,16 +165,16 @@ def test_a_break_before_the_last_image_is_doubtful_and_believed_where_two_mapper
     tracked = np.where(pairs.second == 23, 0.1 * pairs.matches, pairs.tracked)
     witness = replace(sound, pairs=replace(pairs, tracked=tracked))
     verdict = judge_alone(witness, is_sequence=True)
-    assert verdict.grade == "doubtful" and "between frame_022 and frame_023" in verdict.says
+    assert verdict.grade == "doubtful" and "between frame_022 and frame_023" in verdict.summary
     assert judge_together(replace(witness, name="global"), [sound], True).grade == "right"
     inside = np.where((pairs.first < 12) & (pairs.second >= 12), 0.15 * pairs.matches, tracked)
     verdict = judge_alone(replace(sound, pairs=replace(pairs, tracked=inside)), is_sequence=True)
-    assert verdict.grade == "broken" and "between frame_011 and frame_012" in verdict.says
+    assert verdict.grade == "broken" and "between frame_011 and frame_012" in verdict.summary
 
 
 def test_scale_that_breaks_half_way_is_not_right(keypoints):
     verdict = judge_alone(witness_with(moved(np.s_[12:], scale=0.3, about=11), *keypoints), is_sequence=True)
-    assert verdict.grade != "right" and "frame_01" in verdict.says
+    assert verdict.grade != "right" and "frame_01" in verdict.summary
 
 
 def test_collapsed_track_is_broken(keypoints):
@@ -192,7 +192,7 @@ def test_wrong_focal_length_in_a_bend_is_not_right(keypoints):
 def test_one_misplaced_image_of_an_unordered_set_is_named(keypoints):
     poses = moved([7], shift=(3.0, -1.0, 2.0))
     verdict = judge_alone(witness_with(poses, *keypoints), is_sequence=False)
-    assert verdict.grade != "right" and "frame_007" in verdict.says
+    assert verdict.grade != "right" and "frame_007" in verdict.summary
 
 
 def test_gap_in_the_capture_is_no_break(keypoints):
@@ -215,7 +215,7 @@ def test_two_mappers_of_one_mind_are_right_and_of_two_minds_doubtful(sound, keyp
     assert judge_together(sound, [replace(sound, poses=other)], True).grade == "right"
     bent = replace(sound, poses=drive(turn=0.03), name="global", focal=0.7)
     verdict = judge_together(sound, [bent], True)
-    assert verdict.grade == "doubtful" and "0.58 and 0.70 image sides" in verdict.says
+    assert verdict.grade == "doubtful" and "0.58 and 0.70 image sides" in verdict.summary
 
 
 def test_the_chosen_track_is_compared_as_it_was_before_it_alone_was_adjusted(sound):
@@ -251,7 +251,7 @@ def test_scale_that_changes_is_measured_where_it_changes(keypoints):
     poses = moved(np.s_[12:], scale=1.5, about=11)
     points, frames, centers, rays = observed(poses, *keypoints)
     shuffled = np.random.default_rng(5).permutation(len(points))
-    found = scale_changes(points[shuffled], frames[shuffled], centers[shuffled], rays[shuffled], len(poses))
+    actual = scale_changes(points[shuffled], frames[shuffled], centers[shuffled], rays[shuffled], len(poses))
     for gap in (4, 11, 13):
         ratios = []
         for p in np.unique(points):
@@ -266,8 +266,8 @@ def test_scale_that_changes_is_measured_where_it_changes(keypoints):
             ratios += [np.log(at[1] / at[0])] if min(at) > 0 else []
         middle = np.median(ratios)
         error = 1.48 * np.median(np.abs(ratios - middle)) / np.sqrt(len(ratios))
-        assert len(ratios) > 20 and found[gap] == pytest.approx(np.sign(middle) * max(abs(middle) - 3 * error, 0))
-    assert np.nanargmax(np.abs(found)) == 11 and np.exp(found[11]) == pytest.approx(1.5, abs=0.05)
+        assert len(ratios) > 20 and actual[gap] == pytest.approx(np.sign(middle) * max(abs(middle) - 3 * error, 0))
+    assert np.nanargmax(np.abs(actual)) == 11 and np.exp(actual[11]) == pytest.approx(1.5, abs=0.05)
     still = scale_changes(*observed(POSES, *keypoints), len(POSES))
     assert np.nanmax(np.abs(still)) < 0.01
 
@@ -280,7 +280,7 @@ def test_one_misplaced_image_of_a_sequence_is_named_though_most_matches_across_i
     held = held_by_side(witness.pairs, len(sideways))
     assert np.nanmin(held) == min(held[0, 12], held[1, 12]) < 0.4
     verdict = judge_alone(witness, is_sequence=True)
-    assert verdict.grade != "right" and "frame_012 is misplaced" in verdict.says
+    assert verdict.grade != "right" and "frame_012 is misplaced" in verdict.summary
 
 
 def test_false_matches_far_from_their_lines_bend_nothing_and_those_beside_them_do(sound):
@@ -291,7 +291,7 @@ def test_false_matches_far_from_their_lines_bend_nothing_and_those_beside_them_d
     assert judge_alone(false, is_sequence=True).grade == "right"
     bent = replace(sound, pairs=replace(pairs, fitting=fitting, beside=np.where(across, 0.4 * pairs.matches, 0.0)))
     verdict = judge_alone(bent, is_sequence=True)
-    assert verdict.grade == "doubtful" and "bent between frame_011 and frame_012: 60%" in verdict.says
+    assert verdict.grade == "doubtful" and "bent between frame_011 and frame_012: 60%" in verdict.summary
 
 
 def pairs_of_rays(shift, zoom=1.0, count=6):
@@ -329,4 +329,4 @@ def test_a_pixel_without_a_ray_leaves_its_pair_and_a_pair_without_rays_the_other
 def test_without_parallax_a_track_is_doubtful_though_mappers_agree(sound):
     turning = replace(sound, only_turns=True)
     verdict = judge_together(turning, [replace(turning, name="global")], True)
-    assert not sound.only_turns and verdict.grade == "doubtful" and "turns in one place" in verdict.says
+    assert not sound.only_turns and verdict.grade == "doubtful" and "turns in one place" in verdict.summary

@@ -41,14 +41,14 @@ def error_of(model):
 
 
 def test_a_candidate_whose_lens_ends_within_its_images_is_judged(task):
-    model, says = mapping.reconstruct(task, task.database)
-    sound = mapping.witness_of("incremental", says, model, task.database, task.offered)
+    model, summary = mapping.reconstruct(task, task.database)
+    sound = mapping.witness_of("incremental", summary, model, task.database, task.offered)
     for camera in model.cameras.values():
         size = (camera.width, camera.height)
         camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
         camera.params = [0.4 * max(size), size[0] / 2, size[1] / 2, -0.6]
         assert np.isnan(camera.cam_from_img(np.array([[1.0, 1.0]]))).all()
-    broken = mapping.witness_of("incremental", says, model, task.database, task.offered)
+    broken = mapping.witness_of("incremental", summary, model, task.database, task.offered)
     assert np.array_equal(broken.pairs.matches, sound.pairs.matches)
     assert broken.pairs.fitting.sum() < 0.5 * sound.pairs.fitting.sum()
     assert not np.isinf(broken.scales).any() and not broken.only_turns
@@ -62,16 +62,16 @@ def test_a_candidate_that_cannot_be_judged_is_left_out_with_its_reason(task, mon
 
     judged = mapping.witness_of
     monkeypatch.setattr(mapping, "witness_of", witness_of)
-    _, says, verdict = map_and_judge(task)
-    assert says.startswith("incremental") and verdict.grade in ("right", "doubtful")
+    _, summary, verdict = map_and_judge(task)
+    assert summary.startswith("incremental") and verdict.grade in ("right", "doubtful")
     assert "cannot be judged (SVD did not converge)" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_long_sequence_is_confirmed_by_a_part_of_it(task, monkeypatch):
     monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
-    model, says, verdict = map_and_judge(task)
+    model, summary, verdict = map_and_judge(task)
     assert verdict.grade == "right" and model.num_reg_images() == COUNT
-    assert f"{COUNT // 2} of {COUNT // 2} images" in says and "global-all" not in says
+    assert f"{COUNT // 2} of {COUNT // 2} images" in summary and "global-all" not in summary
     assert error_of(model) < 0.01
 
 
@@ -81,8 +81,8 @@ def test_all_images_are_placed_at_once_where_the_incremental_mapper_fails(task, 
 
     monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
     monkeypatch.setattr(mapping, "reconstruct", fail)
-    model, says, _ = map_and_judge(task)
-    assert model.num_reg_images() == COUNT and says.startswith("global-all")
+    model, summary, _ = map_and_judge(task)
+    assert model.num_reg_images() == COUNT and summary.startswith("global-all")
     assert error_of(model) < 0.01
     monkeypatch.setattr(mapping, "map_globally", lambda *args: None)
     (task.work / "none").mkdir()
@@ -105,8 +105,8 @@ def test_a_global_model_without_points_neither_counts_nor_gives_its_focal_length
 
     monkeypatch.setattr(mapping, "map_globally", without_points)
     monkeypatch.setattr(mapping, "reconstruct", watch)
-    model, says, _ = map_and_judge(task)
-    assert says.startswith("incremental") and "global" not in says
+    model, summary, _ = map_and_judge(task)
+    assert summary.startswith("incremental") and "global" not in summary
     assert starts == [task.database] and error_of(model) < 0.01
 
 
@@ -118,12 +118,12 @@ def test_a_placed_model_is_given_the_points_of_all_matches_and_adjusted(task):
         moved.delete_point3D(number)
     for camera in moved.cameras.values():
         camera.params = camera.params * [1.02, 1, 1, 1]
-    found = with_all_points(moved, task.database, task.images, True, 1, rounds=2)
-    assert found.num_points3D() > 0.9 * before and found.num_reg_images() == COUNT
-    (camera,), (given,) = found.cameras.values(), exact.cameras.values()
+    actual = with_all_points(moved, task.database, task.images, True, 1, rounds=2)
+    assert actual.num_points3D() > 0.9 * before and actual.num_reg_images() == COUNT
+    (camera,), (given,) = actual.cameras.values(), exact.cameras.values()
     assert camera.mean_focal_length() == pytest.approx(given.mean_focal_length(), rel=0.01)
-    assert max(p.error for p in found.points3D.values()) <= adjustment.LARGEST_ERROR
-    assert error_of(found) < 0.01
+    assert max(p.error for p in actual.points3D.values()) <= adjustment.LARGEST_ERROR
+    assert error_of(actual) < 0.01
 
 
 def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task, monkeypatch):

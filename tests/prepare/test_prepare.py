@@ -149,7 +149,7 @@ def test_ordered_poses_come_back_in_the_order_of_the_images(scene):
 
 def test_still_corridor_raises_no_warning_and_a_wrong_focal_length_does(tmp_path):
     corridor.write_images(tmp_path / "frames", 9, bend=0.05)  # straight ahead, any focal length would do
-    for factor, says in ((1.0, "None."), (1.6, "does not fit")):
+    for factor, summary in ((1.0, "None."), (1.6, "does not fit")):
         scene = tmp_path / f"{factor}"
         prepare(Settings(tmp_path / "frames", scene, focal=factor * corridor.FOCAL, allow_partial=True, threads=1))
-        assert says in (scene / "report.md").read_text()
+        assert summary in (scene / "report.md").read_text()

@@ -61,10 +61,10 @@ def test_depths_of_the_scene_are_those_of_its_poses(known, frames, tmp_path, cap
         truth = units * corridor.depth(POSES[int(stem[-3:]) - 1])
         for factor in (1, 2):
             path = file if factor == 1 else scene / "depths_2" / file.name
-            shown = read_depth_image(path, 1e-3)  # as nerfstudio does
+            rendered = read_depth_image(path, 1e-3)  # as nerfstudio does
             right = truth[factor // 2 :: factor, factor // 2 :: factor]
-            assert shown.shape == right.shape and (shown[: 40 // factor, : 40 // factor] == 0).all()
-            assert np.median(shown[80 // factor :] / right[80 // factor :]) == pytest.approx(1, abs=0.02)
+            assert rendered.shape == right.shape and (rendered[: 40 // factor, : 40 // factor] == 0).all()
+            assert np.median(rendered[80 // factor :] / right[80 // factor :]) == pytest.approx(1, abs=0.02)
         if not known:
             assert file.read_bytes() == (given / file.name).read_bytes()
             assert meta["mmpi_prepare"]["unit"].startswith(f"1 metre, from depth images of {COUNT} photos")

@@ -64,13 +64,13 @@ def test_a_sequence_is_matched_with_near_and_far_frames_and_where_it_comes_back(
     alike = np.exp(-((place[:, None] - place) ** 2) / 50).astype(np.float32)
     np.fill_diagonal(alike, -1)
     names = [str(i) for i in range(120)]
-    found, says = features.choose_pairs("sequential", names, alike, 4, False)
-    steps = {j - i for i, j in found if j < 115}
+    actual, summary = features.choose_pairs("sequential", names, alike, 4, False)
+    steps = {j - i for i, j in actual if j < 115}
     assert steps == {1, 2, 3, 4, 15, 20, 30, 45}
-    assert sum(j - i == 45 for i, j in found) == 120 - 45
-    assert {(i, 115 + i) for i in range(5)} <= set(found)
-    again = sum(j - i > 45 for i, j in found)
-    assert says == f"sequential (as asked), {again} pairs that may be revisits"
+    assert sum(j - i == 45 for i, j in actual) == 120 - 45
+    assert {(i, 115 + i) for i in range(5)} <= set(actual)
+    again = sum(j - i > 45 for i, j in actual)
+    assert summary == f"sequential (as asked), {again} pairs that may be revisits"
     assert len(features.choose_pairs("exhaustive", names[:7], alike[:7, :7], 4, False)[0]) == 21
 
 
@@ -121,9 +121,9 @@ def test_a_straight_track_is_fitted_without_a_turn_about_itself():
     target = straight.copy()
     target[:, :3, :3] = turn @ straight[:, :3, :3]
     target[:, :3, 3] = 2.5 * straight[:, :3, 3] @ turn.T + [1, 2, 3]
-    found = similarity_between(straight, target)
-    assert found.scale == pytest.approx(2.5) and found.rotation.matrix() == pytest.approx(turn)
-    assert found.translation == pytest.approx([1, 2, 3])
+    actual = similarity_between(straight, target)
+    assert actual.scale == pytest.approx(2.5) and actual.rotation.matrix() == pytest.approx(turn)
+    assert actual.translation == pytest.approx([1, 2, 3])
 
 
 # Lenses --------------------------------------------------------------------------------------------------------------
@@ -175,8 +175,10 @@ def test_images_of_several_cameras_state_their_own_intrinsics():
     split = export.Split(("0.jpg",), ("1.jpg", "2.jpg"), "")
     content = export.transforms(model_of(corridor.poses(3), *cameras), split, True, {}, {})
     assert content["camera_model"] == "OPENCV_FISHEYE" and "fl_x" not in content
-    found = [[f[k] for k in ("file_path", "mask_path", "fl_x", "h", "k3", "k4")] for f in content["frames"]]
-    assert found == [[f"images/{i}.jpg", f"masks/{i}.png", 151 + i % 2, 161 + i % 2, 0.02, 1 + i % 2] for i in range(3)]
+    actual = [[f[k] for k in ("file_path", "mask_path", "fl_x", "h", "k3", "k4")] for f in content["frames"]]
+    assert actual == [
+        [f"images/{i}.jpg", f"masks/{i}.png", 151 + i % 2, 161 + i % 2, 0.02, 1 + i % 2] for i in range(3)
+    ]
     assert content["train_filenames"] == ["images/0.jpg"]
     assert content["test_filenames"] == content["val_filenames"] == ["images/1.jpg", "images/2.jpg"]
     (shared,) = cameras[:1]
@@ -218,8 +220,8 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
     model = model_of(poses, pycolmap.Camera(model="SIMPLE_RADIAL", params=[300, 100, 80, 0.1], **SIZE))
     add_points(model, points, lens, poses, 1 / 3, random)
     adjust(model, 1, lens=True)
-    found = polish(model, 1, lens=True, full_lens=True, principal_point=False)
-    (camera,) = found.cameras.values()
+    actual = polish(model, 1, lens=True, full_lens=True, principal_point=False)
+    (camera,) = actual.cameras.values()
     assert camera.model.name == kept and model.num_points3D() > 150
     assert camera.params[3 if kept == "SIMPLE_RADIAL" else 4] == pytest.approx(0.1, abs=0.05)
     if tangential:

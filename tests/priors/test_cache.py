@@ -22,8 +22,8 @@ def counting(calls, delay=0.0):
 def test_a_result_is_found_once(tmp_path):
     calls = []
     for _ in range(3):
-        found = remembered("key", counting(calls), tmp_path)
-        assert found["x"].tolist() == [0, 1, 2, 3, 4] and found["names"].tolist() == ["a", "bc"]
+        actual = remembered("key", counting(calls), tmp_path)
+        assert actual["x"].tolist() == [0, 1, 2, 3, 4] and actual["names"].tolist() == ["a", "bc"]
     remembered("other", counting(calls), tmp_path)
     assert len(calls) == 2
 
@@ -31,8 +31,8 @@ def test_a_result_is_found_once(tmp_path):
 def test_of_several_that_ask_at_once_one_finds_and_the_others_wait(tmp_path):
     calls = []
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda _: remembered("key", counting(calls, 0.2), tmp_path), range(4)))
-    assert len(calls) == 1 and all(f["x"].tolist() == [0, 1, 2, 3, 4] for f in found)
+        actual = list(pool.map(lambda _: remembered("key", counting(calls, 0.2), tmp_path), range(4)))
+    assert len(calls) == 1 and all(f["x"].tolist() == [0, 1, 2, 3, 4] for f in actual)
 
 
 def test_shapes_and_types_come_back(tmp_path):

@@ -49,9 +49,9 @@ def points_on_walls(pose, count=40):
     return local @ pose[:, :3].T + pose[:, 3]
 
 
-def relative_errors(found, poses):
+def relative_errors(actual, poses):
     """Relative errors of the depths found, and errors over expected errors, of all views together."""
-    pairs = [(d, true_depth(p)[0]) for (_, d), p in zip(found, poses, strict=True)]
+    pairs = [(d, true_depth(p)[0]) for (_, d), p in zip(actual, poses, strict=True)]
     error = np.concatenate([(d.inverse * t - 1)[d.inverse > 0] for d, t in pairs])
     scaled = np.concatenate([((d.inverse - 1 / t) / np.maximum(d.error, 1e-9))[d.inverse > 0] for d, t in pairs])
     return np.abs(error), np.abs(scaled)
@@ -60,26 +60,26 @@ def relative_errors(found, poses):
 @pytest.mark.parametrize(("lens", "fisheye"), [((0.0,) * 4, False), (LENS, False), ((0.0,) * 4, True)])
 def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens, fisheye):
     images = scene_of(tmp_path, POSES, lens, fisheye)
-    found = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
-    cover = np.mean([(d.inverse > 0).mean() for _, d in found])
-    error, scaled = relative_errors(found, POSES)
+    actual = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
+    cover = np.mean([(d.inverse > 0).mean() for _, d in actual])
+    error, scaled = relative_errors(actual, POSES)
     assert cover > 0.9
     assert np.median(error) < 0.003 and np.quantile(error, 0.9) < 0.02 and (error > 0.1).mean() < 0.04
     assert np.quantile(scaled, 0.9) < 2  # these walls are easier than the errors allow for
-    assert all((d.error[d.inverse > 0] > 0).all() and not d.error[d.inverse == 0].any() for _, d in found)
+    assert all((d.error[d.inverse > 0] > 0).all() and not d.error[d.inverse == 0].any() for _, d in actual)
 
 
 def test_without_points_nothing_false_is_believed(tmp_path):
     images = scene_of(tmp_path, POSES)
-    found = list(find_depths(images, lambda i: np.zeros((0, 3)), WIDTH))
-    error, _ = relative_errors(found, POSES)
+    actual = list(find_depths(images, lambda i: np.zeros((0, 3)), WIDTH))
+    error, _ = relative_errors(actual, POSES)
     assert not len(error) or (error > 0.1).mean() < 0.05
 
 
 def test_a_wall_without_texture_has_no_depth(tmp_path):
     images = scene_of(tmp_path, POSES, contrast=0.0)
-    found = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
-    assert not any(d.inverse.any() for _, d in found)
+    actual = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
+    assert not any(d.inverse.any() for _, d in actual)
 
 
 def test_one_image_or_images_of_one_place_have_no_depth(tmp_path):
@@ -136,7 +136,7 @@ def test_what_moves_with_the_camera_has_no_depth(tmp_path):
         picture = np.array(Image.open(file))
         picture[50:100, 70:130] = car if picture.ndim == 2 else car[..., None]
         Image.fromarray(picture).save(file)
-    found = list(find_depths(images, lambda i: points_on_walls(poses[i]), WIDTH))
-    inside = np.mean([(d.inverse[58:92, 78:122] > 0).mean() for _, d in found])
-    outside = np.mean([(d.inverse[:, :60] > 0).mean() for _, d in found])
+    actual = list(find_depths(images, lambda i: points_on_walls(poses[i]), WIDTH))
+    inside = np.mean([(d.inverse[58:92, 78:122] > 0).mean() for _, d in actual])
+    outside = np.mean([(d.inverse[:, :60] > 0).mean() for _, d in actual])
     assert inside < 0.05 and outside > 0.8

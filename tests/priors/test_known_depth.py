@@ -44,17 +44,17 @@ def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):
     pinhole, shape = image.intrinsics[0], (HEIGHT, WIDTH)
     inverse = slanted(pinhole, shape).astype(F32)
     view = View(np.zeros(shape, np.uint8), pinhole, image.camera_to_worlds[0], np.ones(shape, bool))
-    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), image, 0, (15, 20))
+    actual = at_training_pixels(view, Depth(inverse, 0.01 * inverse), image, 0, (15, 20))
     rows, columns = np.meshgrid(np.arange(15) + 0.5, np.arange(20) + 0.5, indexing="ij")
     at = np.stack([columns * 4, rows * 4], -1).reshape(-1, 1, 2)
     matrix = np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]])
     straight = (cv2.fisheye if fisheye else cv2).undistortPoints(at, matrix, np.array(lens, float))[:, 0]
     u, v = straight.T.reshape(2, 15, 20)
     expected = (0.5 + 0.2 * u + 0.1 * v) / np.sqrt(u**2 + v**2 + 1)
-    known = found[..., 0] > 0
+    known = actual[..., 0] > 0
     assert known.mean() > 0.75
-    assert found[known][:, 0] == pytest.approx(expected[known], rel=0.04 if any(lens) or fisheye else 1e-3)
-    assert (found[known][:, 1] > 0.009 * found[known][:, 0]).all()
+    assert actual[known][:, 0] == pytest.approx(expected[known], rel=0.04 if any(lens) or fisheye else 1e-3)
+    assert (actual[known][:, 1] > 0.009 * actual[known][:, 0]).all()
 
 
 def test_a_copy_whose_size_was_rounded_shows_the_whole_original():
@@ -63,10 +63,10 @@ def test_a_copy_whose_size_was_rounded_shows_the_whole_original():
     shape, pinhole = (188, 621), np.array([720.0 * 621 / 1242, 720.0 * 188 / 375, 610 * 621 / 1242, 170 * 188 / 375])
     inverse = slanted(pinhole, shape).astype(F32)
     view = View(np.zeros(shape, np.uint8), pinhole, np.eye(4)[:3], np.ones(shape, bool))
-    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), image, 0, (93, 310))
+    actual = at_training_pixels(view, Depth(inverse, 0.01 * inverse), image, 0, (93, 310))
     u, v = (300.5 * 1242 / 310 - 610) / 720, (10.5 * 375 / 93 - 170) / 720
     # The pixel that is looked up lies within half a training pixel of the exact place.
-    assert found[10, 300, 0] == pytest.approx((0.5 + 0.2 * u + 0.1 * v) / np.sqrt(u * u + v * v + 1), rel=3e-3)
+    assert actual[10, 300, 0] == pytest.approx((0.5 + 0.2 * u + 0.1 * v) / np.sqrt(u * u + v * v + 1), rel=3e-3)
 
 
 def test_areas_take_the_mean_by_certainty_and_edges_have_large_errors():
@@ -97,11 +97,11 @@ def seen(points, cameras, at):
 def test_points_set_the_distance_of_the_pixels_that_saw_them_the_nearest_where_several_did():
     observations = seen([[0, 0, -4], [0, 0, -2], [0, 0, -3]], [0, 0, 1], [[40.9, 30.2], [40.1, 30.7], [3, 5]])
     nothing = nothing_known()
-    found = with_points(nothing, observations)
-    first, second = found.image(0), found.image(1)
+    actual = with_points(nothing, observations)
+    first, second = actual.image(0), actual.image(1)
     assert first[30, 40] == pytest.approx([0.5, POINT_ERROR / 2], rel=STEP) and (first[..., 0] > 0).sum() == 1
     assert second[5, 3] == pytest.approx([0.25, POINT_ERROR / 4], rel=STEP) and nothing.share == 0
-    assert found.share == pytest.approx(2 / (2 * 80 * 60))
+    assert actual.share == pytest.approx(2 / (2 * 80 * 60))
 
 
 @pytest.mark.parametrize("suffix", ["png", "npy"])
@@ -112,10 +112,10 @@ def test_a_depth_image_of_a_sensor_is_along_the_axis_in_its_unit_and_0_is_unknow
     np.save(file, depth) if suffix == "npy" else cv2.imwrite(str(file), depth)
     image = photographed(tmp_path)
     half = replace(image, intrinsics=image.intrinsics / 2, sizes=image.sizes / 2)
-    found = with_sensor(DepthPriors([packed(np.zeros((30, 40, 2)))]), [file], 0.002, half).image(0)
+    actual = with_sensor(DepthPriors([packed(np.zeros((30, 40, 2)))]), [file], 0.002, half).image(0)
     u, v = (5.5 * 2 - 40) / 60, (3.5 * 2 - 30) / 60
-    assert found[3, 5] == pytest.approx(np.array([1, SENSOR_ERROR]) / (6 * np.sqrt(u * u + v * v + 1)), rel=STEP)
-    assert not found[:, 20:].any()
+    assert actual[3, 5] == pytest.approx(np.array([1, SENSOR_ERROR]) / (6 * np.sqrt(u * u + v * v + 1)), rel=STEP)
+    assert not actual[:, 20:].any()
 
 
 def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
@@ -123,8 +123,8 @@ def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
     depth[:30] = 2000
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     before = DepthPriors([packed(np.full((HEIGHT, WIDTH, 2), 0.25))])
-    found = with_sensor(before, [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
-    assert (found[30:] == 0.25).all() and found[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
+    actual = with_sensor(before, [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
+    assert (actual[30:] == 0.25).all() and actual[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
 
 
 def test_a_sensor_and_matches_that_contradict_each_other_are_both_left_out(tmp_path):
@@ -138,10 +138,10 @@ def test_a_sensor_and_matches_that_contradict_each_other_are_both_left_out(tmp_p
     matched[:20, :, 0] = 1.02 * sensor[:20, :, 0]  # within the errors
     matched[:, 40:] = 0.25  # the sensor says nothing
     matched[50:] = 0  # the matches say nothing
-    found = with_sensor(DepthPriors([packed(matched)]), [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
-    assert (found[20:50, :40] == 0).all()
-    assert (found[:20, :40] == sensor[:20, :40]).all() and (found[50:, :40] == sensor[50:, :40]).all()
-    assert (found[:50, 40:] == 0.25).all() and sensor[0, 0, 0] > 0.3
+    actual = with_sensor(DepthPriors([packed(matched)]), [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
+    assert (actual[20:50, :40] == 0).all()
+    assert (actual[:20, :40] == sensor[:20, :40]).all() and (actual[50:, :40] == sensor[50:, :40]).all()
+    assert (actual[:50, 40:] == 0.25).all() and sensor[0, 0, 0] > 0.3
 
 
 @pytest.mark.parametrize("content", [None, b"no image"])

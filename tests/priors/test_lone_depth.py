@@ -42,21 +42,22 @@ def test_a_plane_goes_on(normal, unit):
     """Where a slanted plane is known in the middle, its distances follow outside, in any unit of length."""
     d, kept = directions(), middle()
     exact = plane(normal, 5 * unit, d)
-    found = continued(seen(exact, kept & (exact > 0)), d)
-    added = found[..., 0] > 0
+    actual = continued(seen(exact, kept & (exact > 0)), d)
+    added = actual[..., 0] > 0
     assert not added[kept].any()
     assert added[~kept & (exact > 0)].mean() > 0.6
-    relative = np.abs(found[added][:, 0] / exact[added] - 1)
+    relative = np.abs(actual[added][:, 0] / exact[added] - 1)
     assert (
-        np.median(relative) < 0.01 and (relative < np.maximum(3 * found[added][:, 1] / found[added][:, 0], 1e-3)).all()
+        np.median(relative) < 0.01
+        and (relative < np.maximum(3 * actual[added][:, 1] / actual[added][:, 0], 1e-3)).all()
     )
 
 
 def test_errors_grow_with_the_way_that_is_continued():
     d = directions()
     noise = 1 + 0.02 * np.random.default_rng(0).standard_normal((HEIGHT, WIDTH))
-    found = continued(seen(plane((0.2, 0, -1), 5, d) * noise, middle(30)), d)
-    relative = (found[..., 1] / np.maximum(found[..., 0], 1e-9))[HEIGHT // 2]
+    actual = continued(seen(plane((0.2, 0, -1), 5, d) * noise, middle(30)), d)
+    relative = (actual[..., 1] / np.maximum(actual[..., 0], 1e-9))[HEIGHT // 2]
     assert relative[29] >= LEAST_ERROR * 0.999 and relative[8] > 1.2 * relative[28]
     assert relative.max() < MOST_ERROR
 
@@ -65,8 +66,8 @@ def test_what_is_no_plane_is_not_continued():
     """Distances without any order, a factor of ten apart."""
     kept = middle()
     inverse = 10 ** np.random.default_rng(1).uniform(-1, 0, (HEIGHT, WIDTH))
-    found = continued(seen(inverse, kept), directions())
-    assert (found[..., 0] > 0).mean() < 0.02
+    actual = continued(seen(inverse, kept), directions())
+    assert (actual[..., 0] > 0).mean() < 0.02
 
 
 def test_nothing_known_or_everything_known_adds_nothing():

@@ -37,7 +37,7 @@ def an_image(ahead: float, *boxes: tuple[float, float], knows: bool = True) -> t
     """A camera so far ahead on a textured ground with boxes, so far aside and from the start; where it shows them.
     Unless it ``knows`` them its depths are those of the ground."""
     across, along = np.meshgrid(np.arange(SIZE[1]) + 0.5, np.arange(SIZE[0]) + 0.5)
-    depth, inverse, shown = 1 / np.maximum(ground(), 1e-3), np.maximum(ground(), 0.05), []
+    depth, inverse, visible = 1 / np.maximum(ground(), 1e-3), np.maximum(ground(), 0.05), []
     places = (p.astype(np.float32) for p in (30 * (across - 120) / FOCAL * depth + 400, 30 * (depth + ahead)))
     gray = cv2.remap(texture(0, (900, 800), 700), *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     for seed, (aside, at) in reversed([*enumerate(boxes, 1)]):
@@ -47,11 +47,11 @@ def an_image(ahead: float, *boxes: tuple[float, float], knows: bool = True) -> t
         places = ((p * 50 + 100).astype(np.float32) for p in (right, down))
         painted = cv2.remap(texture(seed, (200, 200), 900), *places, cv2.INTER_LINEAR)
         gray[box], inverse[box & knows] = painted[box], 1 / far
-        shown.insert(0, box)
+        visible.insert(0, box)
     pose = np.eye(4)[:3]
     pose[2, 3] = -ahead
     view = View(gray, PINHOLE, pose, np.ones(SIZE, bool))
-    return Shot(view, cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), Depth(inverse, 0.01 * inverse), ground()), shown
+    return Shot(view, cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), Depth(inverse, 0.01 * inverse), ground()), visible
 
 
 # What moves in one image and its neighbours --------------------------------------------------------------------------
@@ -109,8 +109,8 @@ def a_path(speed: float) -> tuple[Shot, list[Neighbour], list[np.ndarray], list[
     """The last image of a path, those before it, where it shows a box that moves so fast (in speeds of the camera) and
     one that stands, and where they do. The box that moves is about to leave at the side."""
     images = [an_image(-k * STEP, (-2.1, 3.4 - speed * k * STEP), (1.0, 6.0)) for k in range(5)]
-    (shot, shown), *before = images
-    return shot, [Neighbour.of(shot, other) for other, _ in before], shown, [boxes for _, boxes in before]
+    (shot, visible), *before = images
+    return shot, [Neighbour.of(shot, other) for other, _ in before], visible, [boxes for _, boxes in before]
 
 
 @pytest.mark.parametrize("speed", [-0.8, 1.0, 1.3])

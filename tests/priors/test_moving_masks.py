@@ -144,9 +144,9 @@ def test_the_ground_is_found_and_a_wall_is_not_ground():
     rows = np.arange(SIZE[0])[:, None] + 0.5
     ground = np.repeat(np.maximum((rows - 30) / 70 / 1.5, 0), SIZE[1], 1).astype(np.float32)
     up = np.array([0.0, 1.0, 0.0])
-    found = ground_of(a_view(), Depth(ground, 0.01 * ground), up)
-    assert found is not None
-    np.testing.assert_allclose(found[40:], ground[40:], rtol=1e-3)
+    actual = ground_of(a_view(), Depth(ground, 0.01 * ground), up)
+    assert actual is not None
+    np.testing.assert_allclose(actual[40:], ground[40:], rtol=1e-3)
     wall = np.full(SIZE, 0.2, np.float32)
     assert ground_of(a_view(), Depth(wall, 0.01 * wall), up) is None
 
@@ -156,8 +156,8 @@ def test_a_mask_of_a_straightened_view_lies_where_the_lens_shows_it():
     images = PosedImages((), np.eye(4)[None, :3], 2 * PINHOLE[None], np.array([[160.0, 120.0]]), distortion)
     mask = np.zeros(SIZE, bool)
     mask[8:14, 66:72] = True
-    shown = in_image(a_view(), mask, images, 0, (120, 160))
-    y, x = np.argwhere(shown).mean(0) + 0.5
+    visible = in_image(a_view(), mask, images, 0, (120, 160))
+    y, x = np.argwhere(visible).mean(0) + 0.5
     corner = np.array([[[(69 - 40) / 70, (11 - 30) / 70]]])
     bent = cv2.projectPoints(
         np.dstack([corner, np.ones((1, 1))]), *np.zeros((2, 3)), camera_matrix(2 * PINHOLE), distortion[0]
@@ -190,15 +190,15 @@ def outline(mask, core):
 
 
 def test_what_a_neighbour_explains_leaves_from_outside():
-    shown = outline(in_box(HALO), in_box(np.s_[30:34, 38:42]))
+    visible = outline(in_box(HALO), in_box(np.s_[30:34, 38:42]))
     around = cv2.dilate(in_box(SQUARE).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    assert shown[SQUARE].mean() > 0.95 and not shown[~around].any()
+    assert visible[SQUARE].mean() > 0.95 and not visible[~around].any()
 
 
 def test_what_no_neighbour_explains_joins():
-    shown = outline(in_box(np.s_[22:38, 30:41]), in_box(np.s_[30:34, 34:38]))
+    visible = outline(in_box(np.s_[22:38, 30:41]), in_box(np.s_[30:34, 34:38]))
     around = cv2.dilate(in_box(SQUARE).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    assert shown[SQUARE].mean() > 0.95 and not shown[~around].any()
+    assert visible[SQUARE].mean() > 0.95 and not visible[~around].any()
 
 
 def test_another_thing_that_nothing_explains_does_not_join():
@@ -206,8 +206,8 @@ def test_another_thing_that_nothing_explains_does_not_join():
     for box in (np.s_[47:55, 32:48], np.s_[26:34, 50:78]):  # one beside it, one that it touches
         shot.color[box] = textured(2)[box]
     mask, core = in_box(SQUARE), in_box(np.s_[30:34, 38:42])
-    shown = outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)
-    assert not shown[48:].any() and shown[26:34, 50:56].mean() > 0.8 and not shown[:, 50 + AROUND + 2 :].any()
+    visible = outlined(shot, others, [np.zeros(SIZE, bool)] * 2, mask, core, 2.0)
+    assert not visible[48:].any() and visible[26:34, 50:56].mean() > 0.8 and not visible[:, 50 + AROUND + 2 :].any()
 
 
 def test_what_moves_in_a_neighbour_explains_nothing():

@@ -33,26 +33,26 @@ def a_shot(turn: float, step: float, person: tuple[float, float]) -> tuple[Shot,
     tall, wide = 1.7 * FOCAL / depth, 0.5 * FOCAL / depth
     x, y = np.meshgrid(np.arange(SIZE[1]) + 0.5, np.arange(SIZE[0]) + 0.5)
     u, v = (x - column) / wide + 0.5, (y - foot) / tall + 1
-    shown = (u > 0) & (u < 1) & (v > 0) & (v < 1)
+    visible = (u > 0) & (u < 1) & (v > 0) & (v < 1)
     color = texture(7, SIZE, 2.0)
     picture = cv2.remap(
         texture(1, (90, 30), 3.0), (30 * u - 0.5).astype(np.float32), (90 * v - 0.5).astype(np.float32),
         cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
-    color[shown] = picture[shown]
+    color[visible] = picture[visible]
     pose = np.array([[c, 0, -s, 0], [0, 1, 0, 0], [s, 0, c, -step]], float)
     view = View(
         cv2.cvtColor(color, cv2.COLOR_BGR2GRAY), np.array([FOCAL, FOCAL, 100.0, 40.0]), pose, np.ones(SIZE, bool)
     )
     ground = np.maximum((y - 40) / FOCAL / HEIGHT, 0).astype(np.float32)
-    return Shot(view, color, Depth(ground, 0.01 * ground), ground), shown
+    return Shot(view, color, Depth(ground, 0.01 * ground), ground), visible
 
 
 def seen(places, masked):
     """What is followed to three images from those that are masked, and the truth."""
     # Turned by 28 pixels between two.
     pairs = [a_shot(0.14 * k, k * STEP, place) for k, place in enumerate(places)]
-    truth = [shown for _, shown in pairs]
+    truth = [visible for _, visible in pairs]
     masks = [t if k in masked else np.zeros(SIZE, bool) for k, t in enumerate(truth)]
     with ThreadPoolExecutor(1) as pool:
         parts = upright_objects([shot for shot, _ in pairs], [[1, 2], [0, 2], [1, 0]], masks, pool)

@@ -16,7 +16,7 @@ from mmpi_ns.data.posed_images import PosedImages, posed_images
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors.observe import (
     drop_masked,
-    tell_poses,
+    warn_of_poses,
     with_surfaces,
     with_tracks,
 )
@@ -92,10 +92,10 @@ def model(*keypoints) -> SfmModel:
 
 
 def test_tracks_come_in_pixels_of_the_camera_whose_place_names_them():
-    found = with_tracks(bare(), model((0, 2, 0.25, 0.5), (1, 3, 0.75, 0.1), (1, 2, 0.5, 0.5)))
-    assert found.seen_by.tolist() == [0, 1, 1] and found.seen_point.tolist() == [2, 3, 2]
-    assert found.seen_at == pytest.approx(np.array([[10, 10], [60, 6], [40, 30]]))
-    assert np.array_equal(found.points, np.arange(12.0).reshape(4, 3))
+    actual = with_tracks(bare(), model((0, 2, 0.25, 0.5), (1, 3, 0.75, 0.1), (1, 2, 0.5, 0.5)))
+    assert actual.seen_by.tolist() == [0, 1, 1] and actual.seen_point.tolist() == [2, 3, 2]
+    assert actual.seen_at == pytest.approx(np.array([[10, 10], [60, 6], [40, 30]]))
+    assert np.array_equal(actual.points, np.arange(12.0).reshape(4, 3))
 
 
 @pytest.mark.parametrize("depth", [12.0, 120.0])
@@ -113,21 +113,21 @@ def test_searched_surfaces_lie_on_a_textured_wall(tmp_path, depth):
         Image.fromarray(levels.clip(0, 255).round().astype(np.uint8)).save(files[-1])
     pinholes, sizes = (np.tile(row, (count, 1)) for row in ([focal, focal, width / 2, height / 2], [width, height]))
     cameras = Observations(poses, pinholes, sizes.astype(float), points=np.ones((3, 3)))
-    found = with_surfaces(cameras, PosedImages(tuple(files), poses, pinholes, sizes, np.zeros((count, 4))))
-    assert np.array_equal(found.points[:3], np.ones((3, 3))) and len(found.points) > 500 and not len(found.seen_at)
-    assert np.percentile(np.abs(found.points[3:, 2] + depth), 80) < 0.1 * depth
+    actual = with_surfaces(cameras, PosedImages(tuple(files), poses, pinholes, sizes, np.zeros((count, 4))))
+    assert np.array_equal(actual.points[:3], np.ones((3, 3))) and len(actual.points) > 500 and not len(actual.seen_at)
+    assert np.percentile(np.abs(actual.points[3:, 2] + depth), 80) < 0.1 * depth
     # Every view counts for a point that falls on its image, and no other does.
-    local = found.points[3:] - poses[:, None, :, 3]
-    shown = np.abs(focal * local[..., :2] / local[..., 2:]) < [width / 2, height / 2]
-    expected = {(int(i), int(p) + 3) for i, p in np.argwhere(shown.all(-1))}
-    assert set(zip(found.seen_by.tolist(), found.seen_point.tolist(), strict=True)) == expected
-    assert len(found.seen_by) == len(expected) > 2 * len(found.points)
+    local = actual.points[3:] - poses[:, None, :, 3]
+    visible = np.abs(focal * local[..., :2] / local[..., 2:]) < [width / 2, height / 2]
+    expected = {(int(i), int(p) + 3) for i, p in np.argwhere(visible.all(-1))}
+    assert set(zip(actual.seen_by.tolist(), actual.seen_point.tolist(), strict=True)) == expected
+    assert len(actual.seen_by) == len(expected) > 2 * len(actual.points)
 
 
 def test_poses_that_are_off_are_told_with_the_command_that_mends_them(capsys):
-    tell_poses(0.49, Path("room/images_2/a.png"))
+    warn_of_poses(0.49, Path("room/images_2/a.png"))
     assert not capsys.readouterr().out
-    tell_poses(1.34, Path("room/images_2/a.png"))
+    warn_of_poses(1.34, Path("room/images_2/a.png"))
     assert "--poses room/transforms.json --refine-poses" in capsys.readouterr().out.replace("\n", " ")
 
 
@@ -137,8 +137,8 @@ def test_a_mask_leaves_out_the_keypoints_on_its_black_pixels():
     masks = [np.ones((20, 40), bool), np.ones((60, 80), bool)]
     masks[0][10:, :20] = False
     data = as_data(usable=lambda i: masks[i], has_masks=True)
-    found = drop_masked(tracks, data)
-    assert found.seen_point.tolist() == [0, 2, 3] and len(found.seen_at) == 3
+    actual = drop_masked(tracks, data)
+    assert actual.seen_point.tolist() == [0, 2, 3] and len(actual.seen_at) == 3
 
 
 def test_points_that_project_badly_or_that_few_images_see_are_left_out(tmp_path):
@@ -150,6 +150,6 @@ def test_points_that_project_badly_or_that_few_images_see_are_left_out(tmp_path)
     assert whole is not None and len(whole.points) == len(long) < len(rows)
     long[3][7], long[5][7] = "2.01", "1.99"
     path.write_text("\n".join(" ".join(r) for r in rows) + "\n")
-    found = find_sfm_model(tmp_path / "model")
-    assert found is not None and np.array_equal(found.points, np.delete(whole.points, 3, 0))
-    assert len(found.seen_by) == len(whole.seen_by) - len(long[3][8:]) / 2
+    actual = find_sfm_model(tmp_path / "model")
+    assert actual is not None and np.array_equal(actual.points, np.delete(whole.points, 3, 0))
+    assert len(actual.seen_by) == len(whole.seen_by) - len(long[3][8:]) / 2

@@ -68,10 +68,10 @@ def test_details_are_the_weighted_mean_of_the_views():
         "accumulation": torch.ones(1, 1, 1),
         "rgb": torch.full((1, 1, 3), 0.3),
     }
-    shown = Details(torch.stack(cameras), lambda i, _: views[i]).added(
+    result = Details(torch.stack(cameras), lambda i, _: views[i]).added(
         outputs | {"radiance": outputs["rgb"]}, ray, 2, None
     )
-    assert torch.allclose(shown["radiance"], torch.full((1, 1, 3), 0.3 + expected), rtol=1e-3)
+    assert torch.allclose(result["radiance"], torch.full((1, 1, 3), 0.3 + expected), rtol=1e-3)
 
 
 def write(folder, cameras, planes, mask=None, step=7, factors=()):
@@ -126,10 +126,10 @@ def test_an_image_at_a_training_camera_gets_its_details(tmp_path):
     bundle, field = image_rays(camera()), 128 / 255 - planes[0][:3].movedim(0, -1)
     outputs = {"depth": 1 / planes[0][3][..., None], "accumulation": torch.ones(HEIGHT, WIDTH, 1),
                "rgb": field}  # fmt: skip
-    shown = read_details(tmp_path).added(outputs, bundle, 4, None)
+    result = read_details(tmp_path).added(outputs, bundle, 4, None)
     expected = STRENGTH * planes[0][:3].movedim(0, -1)
-    assert torch.allclose(shown["rgb"], (field + expected).clamp(0, 1), atol=4e-3)
-    assert torch.equal(shown["field_rgb"], field)
+    assert torch.allclose(result["rgb"], (field + expected).clamp(0, 1), atol=4e-3)
+    assert torch.equal(result["field_rgb"], field)
     double = read_details(tmp_path).added(outputs, bundle, 4, torch.full((3,), 2.0))
     assert torch.allclose(double["rgb"], (field + 2 * expected).clamp(0, 1), atol=8e-3)
     light = read_details(tmp_path).added(outputs | {"radiance": outputs["rgb"]}, bundle, 4, None)
@@ -173,14 +173,14 @@ def test_details_change_smoothly_as_a_camera_moves(tmp_path):
         for sign in (1, -1, -1, 1, 1, -1)
     ]
     write(tmp_path, joined(*(camera(0.2 * i) for i in range(6))), planes)
-    details, shown = read_details(tmp_path), []
+    details, result = read_details(tmp_path), []
     for x in np.linspace(0.2, 0.8, 241):
         bundle = image_rays(camera(float(x)))
         grey, whole = torch.full((HEIGHT, WIDTH, 3), MIDDLE), torch.ones(HEIGHT, WIDTH, 1)
         outputs = {"rgb": grey, "radiance": grey, "depth": 4 * whole, "accumulation": whole}
-        shown.append(details.added(outputs, bundle, 2, None)["radiance"][8:12, 12:16].mean())
-    steps = torch.stack(shown).diff().abs()
-    assert torch.stack(shown).std() > 0.05
+        result.append(details.added(outputs, bundle, 2, None)["radiance"][8:12, 12:16].mean())
+    steps = torch.stack(result).diff().abs()
+    assert torch.stack(result).std() > 0.05
     assert steps.max() < 0.03
 
 

@@ -46,6 +46,6 @@ def test_pictures_of_more_pixels_than_torch_sorts_are_made():
         "accumulation": one.expand(side, side, 1), "winning_mpi": one.long().expand(side, side, 1),
         "texel_pixels": one.expand(side, side, 1),
     }  # fmt: skip
-    shown = pictures(one.expand(side, side, 3), outputs, 2)["inverse_depth"]
+    rendered = pictures(one.expand(side, side, 3), outputs, 2)["inverse_depth"]
     brightest = torch.quantile(row, 0.98)
-    assert torch.allclose(shown[1234, :, 0], (row / brightest).clamp(max=1), atol=1e-3)
+    assert torch.allclose(rendered[1234, :, 0], (row / brightest).clamp(max=1), atol=1e-3)

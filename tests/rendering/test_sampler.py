@@ -20,10 +20,10 @@ from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 def test_oracle_crosses_planes_where_geometry_says():
     mpi = make_mpi(near=1.0, planes=3, extent=(-1.2, 1.2, -1.0, 1.0))  # depths 1, 2, infinity
-    found = oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8])
-    assert found.intersected.tolist() == [False, True, True]
-    assert found.u.tolist() == pytest.approx([1.5, 1.125, 0.75])
-    assert found.inverse_t.tolist() == pytest.approx([1 / 2.5, 1 / 3.75, 0])
+    actual = oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8])
+    assert actual.intersected.tolist() == [False, True, True]
+    assert actual.u.tolist() == pytest.approx([1.5, 1.125, 0.75])
+    assert actual.inverse_t.tolist() == pytest.approx([1 / 2.5, 1 / 3.75, 0])
     assert oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8], far=4.0).intersected.tolist() == [False, True, False]
     assert oracle.crossings(mpi, [0, 0, -1], [0.6, 0, 0.8], near=3.8).intersected.tolist() == [False, False, True]
 
@@ -114,9 +114,9 @@ def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(thresho
 
 def test_with_a_fair_share_nothing_is_dropped_at_the_start_where_all_weights_are_equal():
     plan = ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)
-    found = render(MMPIField(plan).eval(), bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=0.5, fair_share=0.1)
-    assert found.samples.valid.shape == (1, 64) and found.samples.valid.all()
-    assert torch.allclose(found.composite.weights, torch.tensor(1 / 64), rtol=0.01)
+    actual = render(MMPIField(plan).eval(), bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=0.5, fair_share=0.1)
+    assert actual.samples.valid.shape == (1, 64) and actual.samples.valid.all()
+    assert torch.allclose(actual.composite.weights, torch.tensor(1 / 64), rtol=0.01)
 
 
 @pytest.mark.parametrize("blends", [True, False])
@@ -125,16 +125,16 @@ def test_rays_that_meet_nothing_are_empty(plan, blends):
     field = fill(MMPIField(plan), seed=0)
     backwards, forwards = [0.0, 0, -1], [0.0, 0, 1]
     for directions in ([backwards], [backwards, forwards], np.zeros((0, 3))):
-        found = render(field, bundle(np.zeros((len(directions), 3)), directions), blends=blends)
+        actual = render(field, bundle(np.zeros((len(directions), 3)), directions), blends=blends)
         count = len(directions)
-        assert found.rgb.shape == (count, 3) and len(found.samples.valid) == count
-        assert torch.isfinite(found.rgb).all()
+        assert actual.rgb.shape == (count, 3) and len(actual.samples.valid) == count
+        assert torch.isfinite(actual.rgb).all()
         if count:
-            assert (found.rgb[0] == 0).all() and found.composite.transmittance[0] == 1
-            assert found.samples.num_intersected[0] == 0 and not found.samples.fully_covered[0]
-            assert not found.samples.valid[0].any()
+            assert (actual.rgb[0] == 0).all() and actual.composite.transmittance[0] == 1
+            assert actual.samples.num_intersected[0] == 0 and not actual.samples.fully_covered[0]
+            assert not actual.samples.valid[0].any()
         if count == 2:
-            assert found.composite.transmittance[1] < 0.5
+            assert actual.composite.transmittance[1] < 0.5
 
 
 @pytest.mark.parametrize(("near", "far"), [(0.05, 9.1), (5.1, math.inf), (3.1, 12.3)])
@@ -151,14 +151,14 @@ def test_the_plane_at_infinity_is_sampled_where_the_ray_points_and_not_where_it_
     field = fill(MMPIField(ScenePlan((make_mpi(),), None, 0.05, 1.0), feature_channels=5, hidden_width=6), seed=2)
     direction = unit([0.3, -0.2, 1.0])
     origins = np.array([[0, 0, 0], [0.2, 0.1, 500.0]])
-    found = render(field, bundle(origins, [direction, direction]))
-    last = [int(v.sum()) - 1 for v in found.samples.valid]
+    actual = render(field, bundle(origins, [direction, direction]))
+    last = [int(v.sum()) - 1 for v in actual.samples.valid]
     assert last[1] == 0, "beyond all finite planes only infinity is left"
     for i in range(2):
-        assert found.samples.planes[i, last[i]] == 8
-        assert found.samples.inverse_t[i, last[i]] == 0
-        assert found.samples.ndc[i, last[i]].tolist() == pytest.approx([0.3, -0.4, 1.0], abs=1e-6)
-    assert torch.isfinite(found.rgb).all() and found.composite.weights[1, 0] > 0
+        assert actual.samples.planes[i, last[i]] == 8
+        assert actual.samples.inverse_t[i, last[i]] == 0
+        assert actual.samples.ndc[i, last[i]].tolist() == pytest.approx([0.3, -0.4, 1.0], abs=1e-6)
+    assert torch.isfinite(actual.rgb).all() and actual.composite.weights[1, 0] > 0
     assert render(field, bundle(origins, [direction, direction], far=1e6)).samples.num_intersected.tolist() == [8, 0]
 
 

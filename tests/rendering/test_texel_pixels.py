@@ -37,16 +37,16 @@ def test_a_texel_spans_its_tangent_seen_from_its_mpi_and_more_from_nearer():
     directions = torch.tensor([0.0, 0.0, 1.0]).expand(len(eyes), 3)
     origins = torch.tensor(eyes)[:, None] * directions
     bundle = RayBundle(origins, directions, torch.full((len(eyes), 1), 1e-4))  # 100 pixels a tangent
-    shown = told(heads, bundle, depths, accumulation)
+    result = told(heads, bundle, depths, accumulation)
     # The turned MPI's planes are 0.6 of the distance away; a voxel of 0.3 at a distance of 4; nothing is there.
     expected = torch.tensor([10.0, 10.0, 20.0, 5.0, 6.0, 7.5, 0.0])
-    torch.testing.assert_close(shown["texel_pixels"][:, 0], expected)
-    assert shown["winning_mpi"][:, 0].tolist() == [5, 5, 5, 5, 6, 7, 5]
+    torch.testing.assert_close(result["texel_pixels"][:, 0], expected)
+    assert result["winning_mpi"][:, 0].tolist() == [5, 5, 5, 5, 6, 7, 5]
 
 
 def test_a_texel_of_a_plane_that_faces_the_camera_spans_as_many_pixels_at_the_border_of_the_image():
     pose = torch.tensor([[[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]])
     rays = image_rays(Cameras(pose, 100.0, 100.0, 50.0, 30.0, 100, 60)).flatten()
     count = len(rays.origins)
-    shown = told([2] * count, rays, torch.linspace(1, 9, count).tolist(), [1.0] * count)
-    torch.testing.assert_close(shown["texel_pixels"], torch.full((count, 1), 10.0), rtol=1e-4, atol=0)
+    result = told([2] * count, rays, torch.linspace(1, 9, count).tolist(), [1.0] * count)
+    torch.testing.assert_close(result["texel_pixels"], torch.full((count, 1), 10.0), rtol=1e-4, atol=0)

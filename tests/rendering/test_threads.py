@@ -40,13 +40,13 @@ def cameras_of(run):
     """One by each window's middle, and one between."""
     centers = [torch.tensor(w.center) for w in run.pipeline.model.progress.windows.windows]
     camera = run.pipeline.datamanager.train_dataset.cameras[0:1]
-    found = []
+    actual = []
     for center in (centers[0], 0.5 * (centers[0] + centers[1]), centers[1]):
         moved = camera.to("cpu")
         moved.camera_to_worlds = camera.camera_to_worlds.clone()
         moved.camera_to_worlds[0, :, 3] = center.float()
-        found.append(moved)
-    return found
+        actual.append(moved)
+    return actual
 
 
 def copied(state):

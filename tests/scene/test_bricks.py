@@ -60,15 +60,15 @@ def test_variation_beside_released_bricks_equals_float64(channels, order):
     mixed = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(3))]
     rows = rows.sort()[0] if order == "rising" else mixed
     table = torch.randn(len(grids[0].places) * BRICK, channels, generator=torch.Generator().manual_seed(0)) * 2
-    scales, found = torch.tensor([(0.5 + k, 2.0, 1.0) for k in range(len(grids))]), []
+    scales, actual = torch.tensor([(0.5 + k, 2.0, 1.0) for k in range(len(grids))]), []
     for function, dtype in ((total_variation, torch.float32), (total_variation.reference, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
         value = function(values, table.to(dtype), rows, layout, scales)
         value.backward()
-        found.append((value.item(), values.grad.double()))
-    assert found[0][0] == pytest.approx(found[1][0], rel=1e-6) and found[0][0] > 1
-    assert torch.allclose(found[0][1], found[1][1], atol=2e-6) and not found[0][1][rows < BRICK].any()
-    assert (found[1][1] != 0).float().mean() > 0.9
+        actual.append((value.item(), values.grad.double()))
+    assert actual[0][0] == pytest.approx(actual[1][0], rel=1e-6) and actual[0][0] > 1
+    assert torch.allclose(actual[0][1], actual[1][1], atol=2e-6) and not actual[0][1][rows < BRICK].any()
+    assert (actual[1][1] != 0).float().mean() > 0.9
 
 
 # The empty brick -----------------------------------------------------------------------------------------------------
@@ -122,7 +122,7 @@ def test_growth_equals_dense_growth_where_everything_around_is_stored_and_goes_o
     wide = make_grids(wider, None, True)
     reached = grown_tiles(some, wide, None)
     bricks = make_grids(wider, reached, True)
-    found, wanted = resample(thin, some, bricks, -20.0), resample(dense, full, wide)
+    actual, wanted = resample(thin, some, bricks, -20.0), resample(dense, full, wide)
     flat = torch.full_like(thin, 3.0)
     flat[:BRICK] = -20.0
     flat = resample(flat, some, bricks, -20.0)
@@ -136,11 +136,11 @@ def test_growth_equals_dense_growth_where_everything_around_is_stored_and_goes_o
         rows = a.rows
         assert (rows[there > 1e-6] >= BRICK).all(), "whatever has a stored source is stored"
         alike = (there > 1 - 1e-6) & (rows >= BRICK)
-        assert torch.allclose(found[rows[alike]], wanted[b.rows[alike]], atol=1e-12)
+        assert torch.allclose(actual[rows[alike]], wanted[b.rows[alike]], atol=1e-12)
         partly = (there > 1e-6) & ~alike
-        assert found[rows[partly]].abs().max() <= dense.abs().max() + 1e-9, "no texel mixes with the empty brick"
+        assert actual[rows[partly]].abs().max() <= dense.abs().max() + 1e-9, "no texel mixes with the empty brick"
         assert torch.allclose(flat[rows[there > 1e-6]], torch.tensor(3.0, dtype=torch.float64), atol=1e-9)
-        assert (found[rows[(there == 0) & (rows >= BRICK)]] == -20).all()
+        assert (actual[rows[(there == 0) & (rows >= BRICK)]] == -20).all()
         exact += int(alike.sum())
         assert partly.any() and (rows < BRICK).any()
     assert exact > 500

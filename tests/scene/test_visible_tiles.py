@@ -55,7 +55,7 @@ def read_tiles(bundle, plan, near=0.0):
     frames, grids = Frames.pack(plan.mpis), head_grids(plan)
     o, d = bundle.origins.view(-1, 3), bundle.directions.view(-1, 3)
     hits = plane_hits(o, d, torch.full_like(o[:, :1], near), torch.full_like(o[:, :1], torch.inf), frames)
-    found = torch.zeros(len(grids[0].tiles), dtype=torch.bool)
+    actual = torch.zeros(len(grids[0].tiles), dtype=torch.bool)
     for k, mpi in enumerate(plan.mpis):
         for m in range(mpi.planes):
             intersected = (m <= hits.m_first[:, k]) & (m > hits.m_first[:, k] - hits.count[:, k])
@@ -65,8 +65,8 @@ def read_tiles(bundle, plan, near=0.0):
             v = (hits.v[intersected, k, 0] + w * hits.v[intersected, k, 1] - v0) * (2 / (v1 - v0)) - 1
             plane = torch.full_like(u, mpi.planes - 1 - m, dtype=torch.int64)
             rows, _ = grids[k].bilinear(plane, torch.stack([u, v], -1))
-            found[grids[k].places[rows // BRICK]] = True
-    return found
+            actual[grids[k].places[rows // BRICK]] = True
+    return actual
 
 
 LENSES = {
@@ -82,16 +82,16 @@ def test_every_tile_that_a_pixel_reads_is_reachable_and_few_others_are(lens, see
     params, kind = LENSES[lens]
     shot, plan = cameras(seed, lens=params, kind=kind), plan_around(seed)
     views = TrainingViews.of(shot)
-    found = reachable_tiles(views, plan)
+    actual = reachable_tiles(views, plan)
     # Pixels, and half pixels between them: as dense as texels.
     y, x = torch.meshgrid(torch.arange(0, 40.01, 0.5), torch.arange(0, 64.01, 0.5), indexing="ij")
     grid = torch.stack([y, x], -1).reshape(-1, 2)
     index = torch.arange(3).repeat_interleave(len(grid))[:, None]
     wanted = read_tiles(shot.generate_rays(camera_indices=index, coords=grid.repeat(3, 1)), plan)
-    mpis = len(found) - 3 * 4
-    assert wanted.any() and not wanted[mpis:].any() and found[mpis:].all(), "the cube is all reachable"
-    assert (found | ~wanted).all()
-    extra = (found & ~wanted)[:mpis].sum() / mpis
+    mpis = len(actual) - 3 * 4
+    assert wanted.any() and not wanted[mpis:].any() and actual[mpis:].all(), "the cube is all reachable"
+    assert (actual | ~wanted).all()
+    extra = (actual & ~wanted)[:mpis].sum() / mpis
     assert wanted[:mpis].float().mean() < 0.75 and extra < 0.06, (wanted[:mpis].float().mean(), extra)
 
 
@@ -99,10 +99,10 @@ def test_planes_that_every_camera_has_passed_are_out_of_reach():
     """Even where all they hold lies within the image that a camera would show of what is behind it."""
     shot, mpi = cameras(0, turn=0.0), make_mpi("passed", (0.0, 0.0, 0.0), rotation([1, 0, 0, 0]), near=0.7, planes=8)
     shot.camera_to_worlds[:, :, 3] = torch.tensor([0.0, 0.0, 2.0])
-    found = reachable_tiles(TrainingViews.of(shot), ScenePlan((mpi,), None, 0.05, 1.0))
+    actual = reachable_tiles(TrainingViews.of(shot), ScenePlan((mpi,), None, 0.05, 1.0))
     steps = torch.arange(mpi.planes - 1, -1, -1)
     depths = 1 / (1 / mpi.far + steps * mpi.disparity_step)
-    ahead = found.view(mpi.planes, -1).any(1)
+    ahead = actual.view(mpi.planes, -1).any(1)
     assert (depths < 2).any() and torch.equal(ahead, depths > 2)
 
 

@@ -42,7 +42,7 @@ def command(tmp_path_factory):
     def run(name, *arguments, fork=True):
         """In a fork of a process that has imported nerfstudio, or as it is installed."""
         if fork:
-            return start(name, *arguments, environment=env).end(200).shown
+            return start(name, *arguments, environment=env).end(200).printed
         path = Path(sys.executable).with_name(name)
         done = subprocess.run(
             [str(path), *map(str, arguments)], env=env, cwd=folder, capture_output=True, text=True, timeout=200
@@ -106,9 +106,9 @@ def camera_path(poses):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_shows_its_help(command, method):
-    shown = command("ns-train", method, "--help")
+    printed = command("ns-train", method, "--help")
     for option in ("--pipeline.model.plan-file", "--pipeline.datamanager.keypoint-rays", "--max-num-iterations"):
-        assert option in shown
+        assert option in printed
 
 
 def test_there_are_five_methods():
@@ -128,9 +128,9 @@ def test_eval_writes_metrics_and_pictures(command, run_folder, tmp_path):
         "ns-eval", "--load-config", run_folder / "config.yml", "--output-path", tmp_path / "out.json",
         "--render-output-path", tmp_path / "pictures",
     )  # fmt: skip
-    found = json.loads((tmp_path / "out.json").read_text())
-    assert found["method_name"] == "mmpi-small" and found["checkpoint"].endswith(f"step-{STEPS - 1:09d}.ckpt")
-    results = found["results"]
+    actual = json.loads((tmp_path / "out.json").read_text())
+    assert actual["method_name"] == "mmpi-small" and actual["checkpoint"].endswith(f"step-{STEPS - 1:09d}.ckpt")
+    results = actual["results"]
     assert {"psnr", "ssim", "dropped_mass", "psnr_std"} <= set(results)
     assert results["psnr"] > 12 and 0 < results["ssim"] <= 1 and 0 <= results["dropped_mass"] < 0.2
     names = {p.name.split("-", 1)[-1] for p in (tmp_path / "pictures").iterdir()}
@@ -147,10 +147,10 @@ def test_render_follows_a_camera_path(command, run_folder, poses, tmp_path):
     files = sorted((tmp_path / "out").glob("*.png"))
     assert len(files) == 2
     for i, file in enumerate(files):
-        found = picture(file)
-        assert found.shape == (HEIGHT, 3 * WIDTH, 3)
-        assert resembles(found[:, :WIDTH], TRAIN[i])
-        assert found[:, WIDTH : 2 * WIDTH].std() > 0.01
+        actual = picture(file)
+        assert actual.shape == (HEIGHT, 3 * WIDTH, 3)
+        assert resembles(actual[:, :WIDTH], TRAIN[i])
+        assert actual[:, WIDTH : 2 * WIDTH].std() > 0.01
 
 
 def test_render_writes_every_output_of_the_test_images(command, run_folder, tmp_path):
@@ -160,9 +160,9 @@ def test_render_writes_every_output_of_the_test_images(command, run_folder, tmp_
     )  # fmt: skip
     outputs = {p.name for p in (tmp_path / "out" / "test").iterdir()}
     assert {"rgb", "gt-rgb", "depth", "accumulation", "winning_mpi"} <= outputs
-    found = sorted((tmp_path / "out" / "test" / "rgb").iterdir())
-    assert len(found) == len(TEST)
-    assert all(resembles(picture(f), i) for f, i in zip(found, TEST, strict=True))
+    actual = sorted((tmp_path / "out" / "test" / "rgb").iterdir())
+    assert len(actual) == len(TEST)
+    assert all(resembles(picture(f), i) for f, i in zip(actual, TEST, strict=True))
     truth = picture(sorted((tmp_path / "out" / "test" / "gt-rgb").iterdir())[0])
     assert np.abs(truth - image_of(TEST[0])).max() < 0.01
 

@@ -92,9 +92,9 @@ def test_finer_copies_are_baked_and_shown_as_parts_of_their_mpis(trainer, monkey
     model.show.value = "all"
     head_mask = (torch.arange(2 * count) % count == 0).expand(len(rays), -1)
     with torch.no_grad():
-        shown = render_outputs(bounded(rays, field.plan), field, blends=False, threshold=3e-3, head_mask=head_mask)
-    torch.testing.assert_close(alone["accumulation"], shown["accumulation"])
-    torch.testing.assert_close(alone["depth"], shown["depth"])
+        result = render_outputs(bounded(rays, field.plan), field, blends=False, threshold=3e-3, head_mask=head_mask)
+    torch.testing.assert_close(alone["accumulation"], result["accumulation"])
+    torch.testing.assert_close(alone["depth"], result["depth"])
     assert (alone["depth"] / exact["depth"] - 1).abs().max() > 0.1
 
 
@@ -125,8 +125,8 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
     assert len(scene.path) == 8 and sum(pose.test for pose in scene.path) == 2
     write_baked(scene, tmp_path)
     for which in (scene, read_baked(tmp_path)):
-        found = compare(trainer.pipeline, which, 2)
-        exact, baked = found["exact"], found["baked"]
+        actual = compare(trainer.pipeline, which, 2)
+        exact, baked = actual["exact"], actual["baked"]
         assert baked["to_exact"] > 35 and abs(exact["psnr"] - baked["psnr"]) < 0.3
         assert abs(exact["ssim"] - baked["ssim"]) < 0.01 and baked["seconds"] > 0
     assert bake_run(trainer.pipeline, 0).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks

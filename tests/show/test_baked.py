@@ -39,21 +39,21 @@ def test_agrees_with_the_reader(form, settings, tmp_path):
     raw = reader.read(tmp_path)["windows"][0]
     assert len(raw["network_array"]) == sum(o * (i + 1) for o, i in raw["shader"]["layers"])
     expected = reader.render(raw, rays[0].double().numpy(), rays[1].double().numpy())
-    found = marched(form, window, rays)
-    shown = shaded(form, window, found, rays[1]).numpy()
+    actual = marched(form, window, rays)
+    rendered = shaded(form, window, actual, rays[1]).numpy()
     # A ray that meets the border between stored and empty tiles to the last bit may read either.
-    wrong = np.abs(shown - expected).max(-1) > 5e-3
-    assert wrong.mean() <= 0.05, np.abs(shown - expected).max(-1)[wrong]
+    wrong = np.abs(rendered - expected).max(-1) > 5e-3
+    assert wrong.mean() <= 0.05, np.abs(rendered - expected).max(-1)[wrong]
     if settings.get("stored") == 1.0:
         assert not wrong.any()
     if settings.get("density") != (0, 0):
-        assert (found.mass > 0).any()
+        assert (actual.mass > 0).any()
 
 
-def shaded(form, window, found, directions):
-    rgb = dispatch.function("shade_baked", form)(window.shader, found.gathered, found.mass, directions)
-    rgb = torch.where(found.mass > 0, rgb, 0.0)
-    return (rgb * found.accumulation + 0.5 * found.transmittance).clamp(0, 1)
+def shaded(form, window, actual, directions):
+    rgb = dispatch.function("shade_baked", form)(window.shader, actual.gathered, actual.mass, directions)
+    rgb = torch.where(actual.mass > 0, rgb, 0.0)
+    return (rgb * actual.accumulation + 0.5 * actual.transmittance).clamp(0, 1)
 
 
 @pytest.mark.parametrize("octaves", [0, 2, 5])
@@ -70,10 +70,10 @@ def test_shading_agrees_with_the_reference(octaves, sizes):
     sums = mass * (torch.rand(101, 5, generator=g) * torch.tensor([1, 1, 1, 2, 2]) - torch.tensor([0, 0, 0, 1, 1]))
     mass[3], sums[3], sums[4, :3], sums[5, :3] = 0, 0, 0, mass[5]
     directions = torch.nn.functional.normalize(torch.randn(101, 3, generator=g), dim=-1)
-    found = dispatch.function("shade_baked", "cpu")(shader, sums, mass, directions)
+    actual = dispatch.function("shade_baked", "cpu")(shader, sums, mass, directions)
     expected = dispatch.function("shade_baked", "reference")(shader, sums.double(), mass.double(), directions.double())
     # White to the last bit is not white, and odds may change by e^8.
-    torch.testing.assert_close(found.double(), expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(actual.double(), expected, atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -94,13 +94,13 @@ def test_peaks_are_the_largest_weights(form):
     """A brick's peak is reached, a brick that no ray reads keeps 0, and one ray alone weighs no more than 1."""
     window = random_window(num_mpis=2, density=(150, 255))
     peaks = torch.zeros(window.mpis.num_bricks, 8, 8)
-    found = marched(form, window, rays_into(window, 16), peaks=peaks)
-    assert float(peaks.max()) <= 1 and float(peaks.max()) >= float(found.mass.max()) / 80
+    actual = marched(form, window, rays_into(window, 16), peaks=peaks)
+    assert float(peaks.max()) <= 1 and float(peaks.max()) >= float(actual.mass.max()) / 80
     assert (peaks == 0).any()
     kept = window.keep(peaks.amax((1, 2)) > 0)
     assert kept.mpis.num_bricks == int((peaks > 0).any(-1).any(-1).sum())
     again = marched(form, kept, rays_into(window, 16))
-    torch.testing.assert_close(again.gathered, found.gathered, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(again.gathered, actual.gathered, rtol=1e-4, atol=1e-3)
 
 
 def test_columns_find_every_brick():
@@ -117,7 +117,7 @@ def test_columns_find_every_brick():
 @pytest.mark.parametrize("form", FORMS)
 def test_no_rays_and_no_bricks(form):
     window = random_window(stored=0.0)
-    found = marched(form, window, rays_into(window, 20))
-    assert (found.mass == 0).all() and (found.transmittance == 1).all() and (found.inverse_t == 0).all()
+    actual = marched(form, window, rays_into(window, 20))
+    assert (actual.mass == 0).all() and (actual.transmittance == 1).all() and (actual.inverse_t == 0).all()
     none = marched(form, random_window(), [x[:0] for x in rays_into(window, 20)])
     assert len(none.gathered) == 0

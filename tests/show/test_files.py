@@ -46,9 +46,9 @@ def test_windows_are_mixed_by_their_shares():
     scene = scene_of(a, b, radius=1.5)  # centres 4 apart, margins of 1: shares of a half in the middle
     _, directions, _, _ = rays_into(a, 12)
     origins = torch.tensor([2.0, 0.0, 0.0]).expand(12, 3).contiguous()
-    shown = scene.render(origins, directions)["rgb"]
+    rendered = scene.render(origins, directions)["rgb"]
     parts = [w.render(origins, directions)["rgb"] for w in (a, b)]
-    torch.testing.assert_close(shown, (parts[0] + parts[1]) / 2, atol=1e-5, rtol=0)
+    torch.testing.assert_close(rendered, (parts[0] + parts[1]) / 2, atol=1e-5, rtol=0)
     at_first = scene.render(origins - 2, directions)["rgb"]
     torch.testing.assert_close(at_first, a.render(origins - 2, directions)["rgb"])
 

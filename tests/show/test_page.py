@@ -70,17 +70,17 @@ def psnr(a, b):
 def ours(site, pose):
     scene = read_baked(site)
     origins, directions = camera_rays(pose.__dict__)
-    shown = scene.render(*(torch.tensor(np.array(x), dtype=torch.float32) for x in (origins, directions)))
-    return shown["rgb"].view(pose.size[1], pose.size[0], 3).numpy()
+    screenshot = scene.render(*(torch.tensor(np.array(x), dtype=torch.float32) for x in (origins, directions)))
+    return screenshot["rgb"].view(pose.size[1], pose.size[0], 3).numpy()
 
 
-def shown(tab, number):
+def screenshot(tab, number):
     return tab.picture(f"(mmpi.draw(mmpi.path[{number}], ...mmpi.path[{number}].size), mmpi.gl.canvas.toDataURL())")
 
 
 def test_the_canvas_shows_what_we_render(opened, site):
     for number, pose in enumerate(read_baked(site).path):
-        a, b = shown(opened, number), ours(site, pose)
+        a, b = screenshot(opened, number), ours(site, pose)
         assert b.std() > 0.02  # there is something to see
         assert psnr(a, b) > CLOSE, (number, psnr(a, b))
 
@@ -141,22 +141,22 @@ def test_controls_move_the_camera(opened):
 
 def test_keys_choose_what_is_shown(opened):
     """Depth, winning MPI and one MPI alone differ from the colours, and colours come back."""
-    colors = shown(opened, 1)
+    colors = screenshot(opened, 1)
     pictures = []
     for key in ("2", "3"):
         opened.evaluate(f"mmpi.press('{key}')")
-        pictures.append(shown(opened, 1))
+        pictures.append(screenshot(opened, 1))
     opened.evaluate("mmpi.press('1')")
     alone = []
     for _ in range(3):
         opened.evaluate("mmpi.press('m')")
         assert "alone" in opened.evaluate("document.getElementById('status').textContent")
-        alone.append(shown(opened, 1))
+        alone.append(screenshot(opened, 1))
     pictures.append(max(alone, key=lambda p: np.abs(p - colors).mean()))  # one may be all that is seen
     assert all(np.abs(p - colors).mean() > 0.01 for p in pictures)
     opened.evaluate("mmpi.press('m')")
     assert opened.evaluate("mmpi.alone") is None
-    assert np.array_equal(shown(opened, 1), colors)
+    assert np.array_equal(screenshot(opened, 1), colors)
 
 
 def test_the_console_stays_empty(opened):
@@ -189,7 +189,7 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
     scene = replace(scene_of(*windows, radius=1.9), path=list(path))
     write_baked(scene, tmp_path)
     write_page(tmp_path)
-    difference = lambda number: np.square(shown(tab, number) - ours(tmp_path, path[number])).mean()  # noqa: E731
+    difference = lambda number: np.square(screenshot(tab, number) - ours(tmp_path, path[number])).mean()  # noqa: E731
     with served(tmp_path) as address:
         assert tab.open(f"{address}/index.html") == "ready"
         assert tab.evaluate("mmpi.start") == CapturedPath(np.stack([view.to_world for view in path])).start
@@ -236,13 +236,13 @@ def test_details_are_those_of_baked_scenes(tab, detailed):
             tab.evaluate(f"mmpi.camera = structuredClone(mmpi.path[{number}]); mmpi.touched(); mmpi.feed()")
             tab.until(f"{WHOLE} && mmpi.details.views.length === 3 && mmpi.details.ready(mmpi.path[{number}])")
             a, b, field = (
-                shown(tab, number),
+                screenshot(tab, number),
                 detailed_image(detailed, number),
                 ours(detailed, read_baked(detailed).path[number]),
             )
             assert psnr(a, b) > CLOSE and psnr(field, b) < 28, (number, psnr(a, b), psnr(field, b))
         tab.evaluate("mmpi.press('m')")
-        assert psnr(shown(tab, 0), ours(detailed, read_baked(detailed).path[0])) > CLOSE  # the only MPI alone
+        assert psnr(screenshot(tab, 0), ours(detailed, read_baked(detailed).path[0])) > CLOSE  # the only MPI alone
         tab.evaluate("mmpi.press('m')")
     assert tab.messages == []
 
@@ -265,7 +265,7 @@ def test_one_file_opens_from_the_disk(tab, site, tmp_path):
     write_page(site, tmp_path / "one.html")
     assert tab.open((tmp_path / "one.html").as_uri()) == "ready"
     tab.until(WHOLE)
-    assert shown(tab, 0).std() > 0.02
+    assert screenshot(tab, 0).std() > 0.02
 
 
 def refusal(tab, address):

@@ -18,10 +18,10 @@ from mmpi_show.ops.splat import Gaussians, View, splat_errors, splat_image
 @pytest.fixture(scope="module")
 def window():
     """Everything is stored, one colour in each brick; the nearest planes are opaque."""
-    found = random_window(num_mpis=1, planes=8, stored=1.0, density=(200, 255), seed=3)
-    for table in (found.mpis.density, found.mpis.texels):
+    actual = random_window(num_mpis=1, planes=8, stored=1.0, density=(200, 255), seed=3)
+    for table in (actual.mpis.density, actual.mpis.texels):
         table[:] = table[:, :1, :1]
-    return found
+    return actual
 
 
 def cameras(window):
@@ -50,18 +50,18 @@ def test_the_file_is_what_viewers_read(tmp_path):
     )  # fmt: skip
     size = splats.write_ply(given, tmp_path / "scene.ply")
     assert size == (tmp_path / "scene.ply").stat().st_size
-    found = read(tmp_path / "scene.ply")
-    column = lambda *names: np.stack([found[n] for n in names], -1)  # noqa: E731
+    actual = read(tmp_path / "scene.ply")
+    column = lambda *names: np.stack([actual[n] for n in names], -1)  # noqa: E731
     np.testing.assert_array_equal(column("x", "y", "z"), given.means)
     np.testing.assert_allclose(np.exp(column("scale_0", "scale_1", "scale_2")), given.scales, rtol=1e-5)
     np.testing.assert_array_equal(column("rot_0", "rot_1", "rot_2", "rot_3"), given.rotations)
-    np.testing.assert_allclose(1 / (1 + np.exp(-found["opacity"])), given.alphas, rtol=1e-4)
+    np.testing.assert_allclose(1 / (1 + np.exp(-actual["opacity"])), given.alphas, rtol=1e-4)
     x, y, z = d = np.array([0.6, 0.0, 0.8])
     basis = 0.4886025119029199 * np.array([-y, z, -x])
     for c in range(3):
         rest = column(*(f"f_rest_{3 * c + i}" for i in range(3)))
-        shown = 0.5 + 0.28209479177387814 * found[f"f_dc_{c}"] + rest @ basis
-        np.testing.assert_allclose(shown, given.colors[:, 0, c] + given.colors[:, 1:, c].numpy() @ d, atol=1e-5)
+        rendered = 0.5 + 0.28209479177387814 * actual[f"f_dc_{c}"] + rest @ basis
+        np.testing.assert_allclose(rendered, given.colors[:, 0, c] + given.colors[:, 1:, c].numpy() @ d, atol=1e-5)
 
 
 def test_a_splat_lies_in_its_plane_where_its_texel_is(window):
@@ -98,9 +98,9 @@ def test_fitted_colours_come_closer_to_the_window(window):
 
     def error(made, pose):
         view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-        shown = splat_image(made.gaussians, view, colors_from(made, view.to_world[:, 3]))
-        target = window.render(*pose.rays())["rgb"].view(*shown.shape[:2], 3)
-        return float((shown[..., :3] + 0.5 * shown[..., 3:] - target).square().mean())
+        rendered = splat_image(made.gaussians, view, colors_from(made, view.to_world[:, 3]))
+        target = window.render(*pose.rays())["rgb"].view(*rendered.shape[:2], 3)
+        return float((rendered[..., :3] + 0.5 * rendered[..., 3:] - target).square().mean())
 
     (middle,) = splats.between(poses[:1] + poses[1:], 0.4)[:1]
     small: Pose = replace(middle, size=(24, 16), focal=(20.0, 20.0), center=(12.0, 8.0))
@@ -171,8 +171,8 @@ def test_agrees_with_the_hand_made_renderer(seed):
     image = splat_image(gaussians, VIEW, colors).numpy()
     np.testing.assert_allclose(image, expected, atol=5e-3)  # an alpha at its least to the last bit may count or not
     errors = torch.randn(*expected.shape[:2], 3, generator=torch.Generator().manual_seed(seed))
-    shown = torch.from_numpy(image[..., :3])
-    sums = splat_errors(gaussians, VIEW, colors, shown, errors).numpy()
+    rendered = torch.from_numpy(image[..., :3])
+    sums = splat_errors(gaussians, VIEW, colors, rendered, errors).numpy()
     np.testing.assert_allclose(sums[:, :3], np.einsum("hwn,hwc->nc", weights, errors.numpy()), atol=0.03)
     np.testing.assert_allclose(sums[:, 3], weights.sum((0, 1)), atol=0.03)
 
@@ -195,6 +195,6 @@ def test_opacities_agree_with_finite_differences():
     parts = slopes * errors[..., None] / np.maximum(np.abs(slopes).sum(-1, keepdims=True), 1e-6)
     expected = np.stack([parts.sum((0, 1, 2)), np.abs(slopes).sum((0, 1, 2))], -1)
     given = (torch.tensor(x, dtype=torch.float32) for x in (by_logits(logits), errors))
-    found = splat_errors(gaussians, VIEW, colors, *given)[:, 4:].numpy()
+    actual = splat_errors(gaussians, VIEW, colors, *given)[:, 4:].numpy()
     assert (expected[:, 1] > 0.1).sum() > 4
-    np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.02)
+    np.testing.assert_allclose(actual, expected, rtol=0.02, atol=0.02)

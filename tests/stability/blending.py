@@ -83,7 +83,7 @@ def _blending(heads: int, scale: float, precision: Precision, level: float = 0.0
     def blended(votes: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
         return blended_optical_depth(depth, *blend_shares(votes, torch.tensor(cover), torch.tensor(own)))
 
-    (found,), (found_by_vote, found_by_tau) = tried(precision, blended, given, tau)
+    (actual,), (found_by_vote, found_by_tau) = tried(precision, blended, given, tau)
     wanted = [oracle.blend(t, r, c, int(o)) for t, r, c, o in zip(tau, reliability, cover, own, strict=True)]
     value, by_tau, by_vote = (np.array([getattr(w, n) for w in wanted]) for n in ("depth", "by_tau", "by_reliability"))
     highest = np.where(cover, reliability, -np.inf).max(-1)
@@ -98,7 +98,7 @@ def _blending(heads: int, scale: float, precision: Precision, level: float = 0.0
         compare(found_by_tau, by_tau, by_tau * (spread + tau) + share, 16),
         compare(found_by_vote, by_vote, size_votes, 16 * rounded),
     ]
-    return Outcome.of([compare(found, value, size, 16)], gradients)
+    return Outcome.of([compare(actual, value, size, 16)], gradients)
 
 
 def _ties(heads: int, precision: Precision) -> Outcome:
@@ -106,23 +106,23 @@ def _ties(heads: int, precision: Precision) -> Outcome:
     levels = np.array([-1e3, -40.0, 0.0, 17.0, 1e3])
     reliability, own = float32(np.repeat(levels[:, None], heads, 1)), torch.arange(len(levels)) % heads
     with precision.context():
-        found = blend_shares(reliability, torch.ones_like(reliability, dtype=torch.bool), own)
+        actual = blend_shares(reliability, torch.ones_like(reliability, dtype=torch.bool), own)
     wanted = (-math.log(heads), math.log1p(-1 / heads))
-    return Outcome.of([compare(x, np.full(len(levels), w), 1.0, 4) for x, w in zip(found, wanted, strict=True)])
+    return Outcome.of([compare(x, np.full(len(levels), w), 1.0, 4) for x, w in zip(actual, wanted, strict=True)])
 
 
 def _sole(precision: Precision) -> Outcome:
     """A sole cover keeps exactly tau whatever the others hold, NaN and infinity included; its votes get no gradient."""
     junk = [1e30, -math.inf, math.inf, math.nan, 0.0, -1e3]
     cover, own = torch.tensor([[True, False]] * len(junk)), torch.zeros(len(junk), dtype=torch.long)
-    (found,), (by_tau, by_vote) = tried(
+    (actual,), (by_tau, by_vote) = tried(
         precision,
         lambda tau, votes: blended_optical_depth(tau, *blend_shares(votes, cover, own)),
         taus := [0.0, 1e-30, 1e-7, 3.0, 88.0, 1e4],
         [[5.0, j] for j in junk],
     )
     slopes = [compare(by_tau, np.ones(len(junk)), 1.0, 0), compare(by_vote, np.zeros((len(junk), 2)), 1.0, 0)]
-    return Outcome.of([compare(found, single(taus), 1.0, 0)], slopes)
+    return Outcome.of([compare(actual, single(taus), 1.0, 0)], slopes)
 
 
 # Compositing ---------------------------------------------------------------------------------------------------------
@@ -183,8 +183,8 @@ def _nothing(precision: Precision) -> Outcome:
         made = composite_weights(tau, valid, torch.zeros_like(tau), torch.zeros(3, 1))
         rgb = render_colors(made, torch.rand(3, 4, 3))
         median = median_inverse_distance(made.weights, torch.ones(3, 4), valid)
-    found = torch.cat([rgb, made.accumulation, made.transmittance, median], -1)
-    return Outcome(compare(found, np.tile([0, 0, 0, 0, 1, 0], (3, 1)), 1.0, 0))
+    actual = torch.cat([rgb, made.accumulation, made.transmittance, median], -1)
+    return Outcome(compare(actual, np.tile([0, 0, 0, 0, 1, 0], (3, 1)), 1.0, 0))
 
 
 def _median(precision: Precision) -> Outcome:
@@ -193,8 +193,8 @@ def _median(precision: Precision) -> Outcome:
     weights = single(rng.exponential(1e-4, (8, LONG)))
     inverse_t = single(-np.sort(-rng.random((8, LONG)), axis=-1))
     with precision.context():
-        found = median_inverse_distance(float32(weights), float32(inverse_t), torch.ones(8, LONG, dtype=torch.bool))
-    at = (np.arange(8), np.abs(inverse_t - found.double().numpy()).argmin(-1))
+        actual = median_inverse_distance(float32(weights), float32(inverse_t), torch.ones(8, LONG, dtype=torch.bool))
+    at = (np.arange(8), np.abs(inverse_t - actual.double().numpy()).argmin(-1))
     gathered = np.cumsum(weights, -1)
     share, step = gathered[at] / gathered[:, -1], weights[at] / gathered[:, -1]
     return Outcome(compare(np.maximum(np.abs(share - 0.5) - step, 0), np.zeros(8), 1.0, 4 + math.log2(LONG)))

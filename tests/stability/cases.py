@@ -114,21 +114,21 @@ def tried(
     """
     given = [(x.clone() if isinstance(x, Tensor) else float32(x)).requires_grad_() for x in inputs]
     with precision.context():
-        found = function(*given)
-        results = list(found) if isinstance(found, tuple) else [found]
+        actual = function(*given)
+        results = list(actual) if isinstance(actual, tuple) else [actual]
         weights = [float32(np.broadcast_to(b, r.shape)) for r, b in zip(results, by, strict=False)]
         torch.autograd.backward(results[: len(by)], weights)
     return results, [as_array(x.grad) for x in given if x.grad is not None]
 
 
-def compare(found: Tensor | Array, wanted: Any, size: Array | float, roundings: float) -> Error:
+def compare(actual: Tensor | Array, wanted: Any, size: Array | float, roundings: float) -> Error:
     """Largest error in units of ``size`` (the magnitudes that a number is made of), beside ``roundings`` of them."""
-    found, wanted = as_array(found), np.asarray(wanted, np.float64)
-    if found.shape != wanted.shape:
-        raise ValueError(f"A case compares shapes {found.shape} and {wanted.shape}.")
-    if not np.isfinite(found).all():
+    actual, wanted = as_array(actual), np.asarray(wanted, np.float64)
+    if actual.shape != wanted.shape:
+        raise ValueError(f"A case compares shapes {actual.shape} and {wanted.shape}.")
+    if not np.isfinite(actual).all():
         return Error(math.inf, roundings * UNIT)
-    gap = np.maximum(np.abs(found - wanted) - FLOOR, 0)
+    gap = np.maximum(np.abs(actual - wanted) - FLOOR, 0)
     return Error(float((gap / np.maximum(size, FLOOR)).max(initial=0.0)), roundings * UNIT)
 
 

@@ -52,12 +52,12 @@ def measure_hits(rays: Callable[[], Rays], precision: Precision) -> Outcome:
             wanted = oracle.crossings(mpi, origins[i], directions[i], near, far)
             wrong += int((wanted.intersected != intersected[i])[wanted.margin > ROUNDINGS * UNIT].sum())
             both = wanted.intersected & (intersected[i] > 0)
-            for found, expected, size in (
+            for actual, expected, size in (
                 (u, wanted.u, wanted.size_uv),
                 (v, wanted.v, wanted.size_uv),
                 (inverse_t, wanted.inverse_t, wanted.size_q),
             ):
-                errors.append(compare(found[i, both], expected[both], size[both], ROUNDINGS))
+                errors.append(compare(actual[i, both], expected[both], size[both], ROUNDINGS))
     return Outcome.of(errors, wrong=wrong)
 
 

@@ -32,7 +32,7 @@ def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
     table = torch.zeros(len(grid.places) * BRICK, 2)
     table[grid.rows] = float32(values)
     rows, weights = grid.bilinear(torch.tensor(planes), float32(uv))
-    (found,), (gradient,) = tried(precision, lambda t: interpolate(t, rows, weights), table, by=(by,))
+    (actual,), (gradient,) = tried(precision, lambda t: interpolate(t, rows, weights), table, by=(by,))
     images = values.reshape(2, side, 3, 2)
     wanted, slope, sizes = np.zeros((len(uv), 2)), np.zeros_like(images), np.zeros_like(images)
     reads = np.zeros(images.shape[:3])
@@ -47,7 +47,7 @@ def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
     found_slope = gradient[grid.rows.numpy()].reshape(images.shape)
     # Sums of n terms one after the other: up to n roundings of their magnitudes.
     roundings = 8 + float(reads.max())
-    value = compare(found, wanted, side * np.abs(images).max(), 4)
+    value = compare(actual, wanted, side * np.abs(images).max(), 4)
     return Outcome(value, compare(found_slope, slope, sizes, roundings))
 
 
@@ -74,8 +74,8 @@ def _merge_order(keys: Array, precision: Precision, empty: bool = False) -> Outc
     wrong = 0
     for ray in range(rays):
         wanted = [n for *_, n in sorted((-keys[r, k, i], k, i, n) for n, (k, r, i) in enumerate(flat) if r == ray)]
-        found = index[ray][valid[ray]].tolist()
-        wrong += sum(a != b for a, b in zip(found, wanted, strict=False)) + abs(len(found) - len(wanted))
+        actual = index[ray][valid[ray]].tolist()
+        wrong += sum(a != b for a, b in zip(actual, wanted, strict=False)) + abs(len(actual) - len(wanted))
     return Outcome.of([], wrong=wrong)
 
 

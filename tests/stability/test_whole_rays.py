@@ -34,10 +34,10 @@ def test_whole_rays_and_their_gradients_are_those_of_float64(hard):
         field.touched.copy_(torch.rand(field.touched.shape, generator=g) > 0.6)
     s = s.clear()
     exact, by = s.exact(), np.random.default_rng(0).normal(size=(len(s.bundle), 3))
-    found, wanted = s.render(), exact.render()
-    assert samples_of(found)[0] == samples_of(wanted)[0]
-    assert float((found.rgb - wanted.rgb).abs().max()) <= 2e-4 * float(wanted.rgb.abs().max())
-    slopes, exactly = gradients_of(field, found, by), gradients_of(exact.field, wanted, by)
+    actual, wanted = s.render(), exact.render()
+    assert samples_of(actual)[0] == samples_of(wanted)[0]
+    assert float((actual.rgb - wanted.rgb).abs().max()) <= 2e-4 * float(wanted.rgb.abs().max())
+    slopes, exactly = gradients_of(field, actual, by), gradients_of(exact.field, wanted, by)
     assert slopes.keys() == exactly.keys() >= {"density", "features"} and blends == ("reliability" in slopes)
     for name, slope in slopes.items():
         assert torch.isfinite(slope).all()

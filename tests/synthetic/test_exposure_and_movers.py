@@ -84,8 +84,8 @@ def test_masks_hold_all_that_movers_change_and_little_else(walk, busy):
 
 
 def test_no_keypoint_lies_on_a_mover(busy):
-    found = sfm_points(busy, 300, noise_pixels=0.0, outliers=0.0)
-    for i in np.unique(found.camera):
-        hit = busy.filmed_by(i).hit(*busy.cameras.rays(i, found.pixel[found.camera == i]))[1]
+    actual = sfm_points(busy, 300, noise_pixels=0.0, outliers=0.0)
+    for i in np.unique(actual.camera):
+        hit = busy.filmed_by(i).hit(*busy.cameras.rays(i, actual.pixel[actual.camera == i]))[1]
         if not busy.cameras.is_test[i]:
             assert not (busy.filmed_by(i).moving[hit] & (hit >= 0)).any()

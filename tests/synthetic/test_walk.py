@@ -65,14 +65,14 @@ def test_nerfstudio_reads_the_lens_and_draws_the_same_rays(walk, folder):
 def test_points_and_depths_agree_with_the_lens(walk, folder):
     import pycolmap
 
-    found = sfm_points(walk, 100, noise_pixels=0.0, outliers=0.0)
-    off = walk.cameras.project(found.camera, found.points[found.point])[0] - found.pixel
-    assert np.abs(found.points - found.true_points).max() < 1e-6 and np.linalg.norm(off, axis=-1).max() < 1e-6
+    actual = sfm_points(walk, 100, noise_pixels=0.0, outliers=0.0)
+    off = walk.cameras.project(actual.camera, actual.points[actual.point])[0] - actual.pixel
+    assert np.abs(actual.points - actual.true_points).max() < 1e-6 and np.linalg.norm(off, axis=-1).max() < 1e-6
     model = pycolmap.Reconstruction(str(folder / "colmap/sparse/0"))
     assert model.cameras[1].model.name == "OPENCV" and max(p.error for p in model.points3D.values()) < 1e-4
     meta = json.loads((folder / "transforms.json").read_text())
     millimetres = cv2.imread(str(folder / meta["frames"][2]["depth_file_path"]), cv2.IMREAD_UNCHANGED).astype(float)
-    points, seen = found.true_points[found.point], found.camera == 2
+    points, seen = actual.true_points[actual.point], actual.camera == 2
     pixels, depths = walk.cameras.project(2, points[seen])
     stored = millimetres[tuple(pixels.astype(int).T[::-1])] / 1000
     assert seen.sum() > 20 and np.median(np.abs(stored / depths - 1)) < 0.02

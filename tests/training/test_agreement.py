@@ -33,5 +33,5 @@ def test_a_form_that_computes_something_else_is_named(monkeypatch):
         return right(tau if dispatch._chosen == "torch" else 1.1 * tau, *others)
 
     monkeypatch.setattr(rendered, "composite_weights", wrong)
-    found = disagreement(field, rays, MarchOptions(1e-3))
-    assert "gradients of density" in found and "colours" in found
+    actual = disagreement(field, rays, MarchOptions(1e-3))
+    assert "gradients of density" in actual and "colours" in actual

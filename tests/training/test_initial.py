@@ -38,16 +38,16 @@ def slow_votes(plan, origins, directions, depths, colors):
     out, unsure = {}, set()
     for origin, direction, (inverse, error), color in zip(origins, directions, depths, colors, strict=True):
         for k, mpi in enumerate(plan.mpis):
-            found, (u0, u1, v0, v1) = oracle.crossings(mpi, origin, direction, plan.ray_near), mpi.extent
+            actual, (u0, u1, v0, v1) = oracle.crossings(mpi, origin, direction, plan.ray_near), mpi.extent
             o, d, _ = oracle.in_frame(mpi, origin, direction)
             w = oracle.disparities(mpi)
             # The next plane's inverse distance, from the slope of 1/t = w d / (1 - w o) over the disparity w of planes.
             spacings = (w[0] - w[1]) * np.abs(d[2]) / (1 - w * o[2]) ** 2
-            for plane in np.flatnonzero(found.intersected | (found.margin <= TOO_CLOSE)).tolist():
-                x, y = (found.u[plane] - u0) / (u1 - u0), (found.v[plane] - v0) / (v1 - v0)
+            for plane in np.flatnonzero(actual.intersected | (actual.margin <= TOO_CLOSE)).tolist():
+                x, y = (actual.u[plane] - u0) / (u1 - u0), (actual.v[plane] - v0) / (v1 - v0)
                 x, y, spacing = x * (mpi.width - 1), y * (mpi.height - 1), spacings[plane]
                 width = max(error, PLANE_ERROR * spacing)
-                before, margin = (found.inverse_t[plane] - inverse) / width, found.margin[plane]
+                before, margin = (actual.inverse_t[plane] - inverse) / width, actual.margin[plane]
                 near = min(abs(abs(before) - 1), abs(before - EMPTY_FROM), abs(x % 1 - 0.5), abs(y % 1 - 0.5), margin)
                 if near < TOO_CLOSE or abs(1 - w[plane] * o[2]) < 2e-3:
                     unsure.update((k, plane, b, a) for b in _near(y, mpi.height) for a in _near(x, mpi.width))
@@ -117,8 +117,8 @@ def test_planes_before_a_surface_are_empty_the_surface_is_dense_and_what_lies_be
     assert after[surface - 1] == before[surface - 1], "within two errors of the surface: no vote"
     assert after[surface].item() == pytest.approx((500 + PRIOR * before[surface].item()) / (500 + PRIOR), rel=1e-3)
     assert torch.equal(after[surface + 1 :], before[surface + 1 :])
-    shown = field.features.data[rows[surface], :3].sigmoid()
-    assert torch.allclose(shown, torch.tensor([0.9, 0.5, 0.1]), atol=1e-4)
+    rendered = field.features.data[rows[surface], :3].sigmoid()
+    assert torch.allclose(rendered, torch.tensor([0.9, 0.5, 0.1]), atol=1e-4)
     assert not field.features.data[rows[:surface]].any()
 
 

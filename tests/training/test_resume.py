@@ -58,8 +58,8 @@ STOPPED = {"split": (2, 5, 11, 12, 17, STEPS - 2), "all": (5, 11, 17), "finer": 
 def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, resumed, step):
     folder = resumed(step)
     for last in range(max(step + 1, STEPS - 2), STEPS):
-        wanted, found = load(whole[1], last), load(folder, last)
-        assert differences(compared(wanted), compared(found)) == []
+        wanted, actual = load(whole[1], last), load(folder, last)
+        assert differences(compared(wanted), compared(actual)) == []
     assert sorted(int(p.stem[5:]) for p in folder.iterdir()) == list(range(step + 1, STEPS))
     last, first = (load(folder, s)["optimizers"]["density"]["state"] for s in (STEPS - 1, step + 1))
     assert not last, "after the last step nobody needs moments"
@@ -153,8 +153,8 @@ def test_a_run_that_died_goes_on_from_its_last_checkpoint(whole, scene, plan_fil
     assert [p.name for p in trainer.checkpoint_dir.iterdir()] == [f"step-{step - 1:09d}.ckpt"]
     again = ready(trainer_config(scene, plan_file, tmp_path / "b", STEPS, **whole[0]), load_dir=trainer.checkpoint_dir)
     again.train()
-    found = load(again.checkpoint_dir, STEPS - 1)
-    assert differences(compared(load(whole[1], STEPS - 1)), compared(found)) == []
+    actual = load(again.checkpoint_dir, STEPS - 1)
+    assert differences(compared(load(whole[1], STEPS - 1)), compared(actual)) == []
 
 
 @pytest.mark.parametrize("step", [12])
@@ -174,8 +174,8 @@ def test_a_run_that_was_asked_to_stop_saves_the_step_it_did_last(whole, scene, p
     assert differences(compared(load(whole[1], step)), compared(load(trainer.checkpoint_dir, step))) == []
     again = ready(trainer_config(scene, plan_file, tmp_path / "b", STEPS, **whole[0]), load_dir=trainer.checkpoint_dir)
     again.train()
-    found = load(again.checkpoint_dir, STEPS - 1)
-    assert differences(compared(load(whole[1], STEPS - 1)), compared(found)) == []
+    actual = load(again.checkpoint_dir, STEPS - 1)
+    assert differences(compared(load(whole[1], STEPS - 1)), compared(actual)) == []
 
 
 def test_a_full_disk_leaves_the_old_checkpoint_and_nothing_else(scene, plan_file, tmp_path, monkeypatch):

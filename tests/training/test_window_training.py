@@ -122,8 +122,8 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, scene, windows_file,
     trainer = ready(config, load_dir=whole.checkpoint_dir, load_step=step)
     torch.rand(5)
     trainer.train()
-    found, wanted = (load(t.checkpoint_dir, 2 * STEPS - 1) for t in (trainer, whole))
-    assert differences(compared(wanted), compared(found)) == []
+    actual, wanted = (load(t.checkpoint_dir, 2 * STEPS - 1) for t in (trainer, whole))
+    assert differences(compared(wanted), compared(actual)) == []
     ours, theirs = (
         torch.load(t.base_dir / "windows" / "window-00000.pt", weights_only=True)["field"] for t in (trainer, whole)
     )

@@ -111,9 +111,9 @@ CLOUDS = {
 def test_a_point_cloud_that_cannot_be_read_is_named_and_training_goes_on(data, edit, tmp_path, case):
     (data / "cloud.ply").write_bytes(CLOUDS[case])
     edit(file(ply_file_path="cloud.ply"))
-    shown = train(data, tmp_path).shown
-    assert "is not a PLY file of points" in shown and "Training goes on without the point cloud" in shown
-    assert str(data / "cloud.ply") in shown and "Training finished" in shown
+    printed = train(data, tmp_path).printed
+    assert "is not a PLY file of points" in printed and "Training goes on without the point cloud" in printed
+    assert str(data / "cloud.ply") in printed and "Training finished" in printed
 
 
 def test_a_capture_without_training_images_is_refused(data, edit, tmp_path):
@@ -158,12 +158,12 @@ RUNS = {
 @pytest.mark.parametrize("case", RUNS)
 def test_a_capture_that_is_odd_and_usable_trains(data, edit, tmp_path, case):
     edit(RUNS[case])
-    assert "Training finished" in train(data, tmp_path).shown
+    assert "Training finished" in train(data, tmp_path).printed
 
 
 def test_test_images_that_are_trained_on_are_told(data, edit, tmp_path):
     edit(lambda meta: meta["train_filenames"].append(meta["test_filenames"][0]))
-    assert "1 of 2 test images are training images too: scores say little" in train(data, tmp_path).shown
+    assert "1 of 2 test images are training images too: scores say little" in train(data, tmp_path).printed
 
 
 # mmpi-plan -----------------------------------------------------------------------------------------------------------

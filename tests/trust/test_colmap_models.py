@@ -48,7 +48,7 @@ MODELS = {
 
 
 def test_a_whole_binary_model_trains(data, model, tmp_path):
-    said = train(data, tmp_path).shown
+    said = train(data, tmp_path).printed
     assert "Training finished" in said and "No SfM tracks" not in said
 
 

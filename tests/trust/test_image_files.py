@@ -25,7 +25,7 @@ ODD = {
 @pytest.mark.parametrize("kind", ODD)
 def test_images_of_other_kinds_among_rgb_train(data, tmp_path, kind):
     ODD[kind]().save(data / "images" / name_of(3))
-    assert "Training finished" in train(data, tmp_path).shown
+    assert "Training finished" in train(data, tmp_path).printed
 
 
 DAMAGED = {

@@ -18,7 +18,7 @@ def plan_text(whole_scene, tmp_path_factory):
 def test_a_plan_that_is_usable_trains(whole_scene, plan_text, tmp_path):
     path = tmp_path / "plan.json"
     path.write_text(plan_text)
-    assert "Training finished" in train(whole_scene, tmp_path, pipeline__model__plan_file=path).shown
+    assert "Training finished" in train(whole_scene, tmp_path, pipeline__model__plan_file=path).printed
 
 
 def test_a_plan_that_no_camera_sees_is_refused(whole_scene, plan_text, tmp_path):
@@ -44,10 +44,10 @@ def test_a_plan_that_needs_more_memory_than_there_is_is_refused_before_anything_
 
 def test_a_plan_that_was_edited_is_kept_beside_the_new_one(whole_scene, tmp_path):
     words = ("mmpi-plan", whole_scene, "--output", tmp_path / "o")
-    assert "Wrote plan.json" in run(*words).shown
+    assert "Wrote plan.json" in run(*words).printed
     path = tmp_path / "o" / "plan.json"
     first, plan = path.read_text(), json.loads(path.read_text())
     plan["mpis"][0]["planes"] += 1
     path.write_text(json.dumps(plan))
-    assert "Wrote plan.json" in run(*words).shown and path.read_text() == first
+    assert "Wrote plan.json" in run(*words).printed and path.read_text() == first
     assert json.loads((tmp_path / "o" / "plan.json.before").read_text()) == plan

@@ -77,7 +77,7 @@ def terminal(_):
 def test_a_run_is_saved_where_those_who_read_its_output_went_too(whole_scene, tmp_path, makes, numbers):
     """Ctrl-C ends ``| tee``, too; of a terminal that is closed two signals come."""
     reader, name = makes(tmp_path)
-    running, said, end = start_train(whole_scene, tmp_path, shown_on=name, **LONG), b"", time.monotonic() + 60
+    running, said, end = start_train(whole_scene, tmp_path, printed_to=name, **LONG), b"", time.monotonic() + 60
     while b"batch PSNR" not in said and time.monotonic() < end:
         time.sleep(0.02)
         with suppress(BlockingIOError):
@@ -92,10 +92,10 @@ def test_a_run_is_saved_where_those_who_read_its_output_went_too(whole_scene, tm
 def test_details_that_a_stopped_run_lacks_are_made_when_it_goes_on(whole_scene, finished, tmp_path):
     shutil.rmtree(finished / "details")
     again = {"load_dir": finished / "nerfstudio_models", "max_num_iterations": 6}
-    said = train(whole_scene, tmp_path, **again).shown
+    said = train(whole_scene, tmp_path, **again).printed
     assert "already holds 6 of 6 steps: details of its training images are made" in said and "ns-eval" in said
-    assert "no details" not in evaluate(finished, tmp_path).shown
-    assert "nothing to do" in train(whole_scene, tmp_path, **again).shown
+    assert "no details" not in evaluate(finished, tmp_path).printed
+    assert "nothing to do" in train(whole_scene, tmp_path, **again).printed
 
 
 def test_a_stopped_run_goes_on_in_its_folder(whole_scene, tmp_path):

@@ -13,22 +13,22 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.scene.texels import BRICK
 
 AT_LEAST = 4096
-"""Rows that are worth another thread."""
+"""Rows that justify another thread."""
 AT_ONCE = 1024
-"""Rows of a part that is left to other threads, for which an operation may have to wait: some 0.05 ms."""
+"""Rows of a part that other threads update later; an operation may have to wait for one part, some 0.05 ms."""
 
 
 class AdamConstants(NamedTuple):
-    """Of one step."""
+    """Constants of one step."""
 
     beta1: float
     beta2: float
     correction: float | Tensor
-    """Root of the second moment's: sqrt(1 - beta2^step). On a GPU a tensor [], like the rate: steps are recorded once
-    and repeated with other numbers."""
+    """Root of the second moment's correction: sqrt(1 - beta2^step). On a GPU a tensor [], like the rate, since recorded
+    steps are replayed with other values."""
     eps: float
     rate: float | Tensor
-    """With the first moment's correction: lr / (1 - beta1^step)."""
+    """Learning rate with the first moment's correction: lr / (1 - beta1^step)."""
 
 
 @operation("gpu")
@@ -39,7 +39,7 @@ def adam_rows(
     grad: Float[Tensor, "U C"],
     constants: AdamConstants,
 ) -> Pending | None:
-    """One step of Adam on distinct rows. The empty brick, and entries whose gradient is exactly 0, are left alone.
+    """One step of Adam on distinct rows. The empty brick and entries whose gradient is exactly 0 do not change.
 
     Args:
         param: the table.
@@ -49,7 +49,7 @@ def adam_rows(
         constants: of the step.
 
     Returns:
-        What is to be kept until ``param`` and ``moments`` are read, and finished before; None: nothing.
+        The pending part of the step, to be finished before ``param`` and ``moments`` are read; None if there is none.
     """
     grad = grad.masked_fill((rows < BRICK)[:, None], 0)
     new_param, new_moments = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)

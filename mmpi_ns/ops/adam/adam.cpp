@@ -8,7 +8,7 @@
 
 namespace {
 
-// Numbers in bfloat16 are the upper halves of floats; the nearest, and of two the even one.
+// Numbers in bfloat16 are the upper halves of floats, rounded to nearest even.
 float widen(uint16_t half) {
     const uint32_t bits = uint32_t(half) << 16;
     float x;
@@ -22,7 +22,7 @@ uint16_t narrow(float x) {
     return uint16_t((bits + 0x7fff + ((bits >> 16) & 1)) >> 16);
 }
 
-// Adam on distinct rows; the empty brick, and entries whose gradient is exactly 0, are left alone. `moments`
+// Adam on distinct rows; the empty brick and entries whose gradient is exactly 0 do not change. `moments`
 // [T, 2, channels], means and uncentred variances, are in bfloat16.
 void mmpi_adam_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t channels, const float* grad, float* param,
                     uint16_t* moments, float beta1, float beta2, float correction, float eps, float rate) {

@@ -14,7 +14,7 @@ from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gpu_scene import STORED, block_size, launch
 
 NUMBERS = 512
-"""Entries of a program."""
+"""Entries per program."""
 
 
 @triton.jit(do_not_specialize=("count",))
@@ -22,7 +22,7 @@ def adam_kernel(
     params, moments, rows, grads, correction, rate, count, channels, keep1, new1, keep2, new2, eps,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Entries whose gradient is 0, and the empty brick, are left alone."""
+    """Update of the entries with a gradient other than 0, except for the empty brick."""
     number, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
     row = tl.load(rows + number, number < count, 0)
     filled = ((number < count) & (row >= STORED))[:, None] & (column < channels)

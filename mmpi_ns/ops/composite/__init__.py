@@ -1,7 +1,7 @@
 """Volume rendering of merged samples in log space (paper sec. III-B): weights, colour, depth, and the winning head.
 
-A sample is carried by its optical depth tau = -log(1 - alpha), never by alpha: alpha = 1 is an infinite slope of
-log(1 - alpha), while tau is an ordinary number. All arithmetic is float32 or wider, also under autocast.
+A sample stores its optical depth tau = -log(1 - alpha), never alpha: at alpha = 1 the slope of log(1 - alpha) is
+infinite, while tau is an ordinary number. All arithmetic is float32 or wider, also under autocast.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ Run = Callable[..., None]
 
 
 def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
-    """Sum of all earlier samples on the ray. Shifted, not subtracted: x - x loses what came before a large x."""
+    """Sum of all earlier samples on the ray. Shifted, not subtracted: x - x loses small terms before a large x."""
     shifted = torch.nn.functional.pad(values[:, :-1], (1, 0))
     return shifted.cumsum(-1)
 
 
 @dataclass(frozen=True)
 class Composite:
-    """What a ray has gathered. All values are per ray, weights per sample."""
+    """Weights of the samples [R, S]; accumulation and transmittance of the rays [R, 1]."""
 
     weights: Float[Tensor, "R S"]
-    """T_k alpha'_k of the samples that were kept."""
+    """T_k alpha'_k of the kept samples."""
     accumulation: Float[Tensor, "R 1"]
-    """1 - transmittance behind the last sample, the dropped ones included."""
+    """1 - transmittance, with the dropped samples."""
     transmittance: Float[Tensor, "R 1"]
-    """What passes the whole ray."""
+    """Behind the last sample."""
 
 
 @operation("gpu")
@@ -58,7 +58,7 @@ def composite_weights(
         skipped_total: optical depth of all dropped samples of the ray.
 
     Returns:
-        Weights T_k (1 - exp(-tau_k)), accumulation and remaining transmittance.
+        Weights T_k (1 - exp(-tau_k)), accumulation and transmittance.
 
     Source: paper eq. (rendering) and its blended form in sec. III-C.
     """
@@ -106,7 +106,7 @@ composite_weights.on_cpu(
 def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
     """Colour gathered along each ray, without background, with gradients to weights and colours.
 
-    The mass of the dropped samples is given the mean colour of those kept (a constant factor per ray), so that dropping
+    The weight of the dropped samples takes the mean colour of the kept ones (a constant factor per ray), so pruning
     does not darken the image.
     """
     kept = composite.weights.sum(-1, keepdim=True)
@@ -118,9 +118,9 @@ def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float
 def median_inverse_distance(
     weights: Float[Tensor, "R S"], inverse_t: Float[Tensor, "R S"], valid: Bool[Tensor, "R S"]
 ) -> Float[Tensor, "R 1"]:
-    """1/t of the sample at which a ray has gathered half of what it gathers; 0 (infinity) for an empty ray.
+    """1/t of the sample at which a ray reaches half of its accumulated weight; 0 (infinity) for an empty ray.
 
-    Depends on one ray alone, so not on how an image is cut into chunks.
+    Independent of the other rays, and so of the chunks of an image.
     """
     gathered = weights.cumsum(-1)
     total = gathered[:, -1:]
@@ -131,6 +131,6 @@ def median_inverse_distance(
 
 
 def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_heads: int) -> Float[Tensor, "R 1"]:
-    """The head that gives each ray most of its weight, as nerfstudio's images take it; the first of equals."""
+    """Head with the largest weight on each ray, for nerfstudio's images; the first of equal ones."""
     mass = weights.new_zeros(len(weights), num_heads).scatter_add(1, heads, weights)
     return mass.argmax(-1, keepdim=True).to(weights.dtype)

@@ -20,15 +20,15 @@ Lanes absorbed(Lanes x) {
     return x > 0.25f ? thick : thin;
 }
 
-// Optical depths of one ray, padded with zeros to whole lanes, and what lies in front of each sample. Empty slots at the
-// end of a ray are left out.
+// Optical depths of one ray, padded with zeros to whole lanes, and the depth in front of each sample. Empty slots at
+// the end of a ray are skipped.
 struct Ray {
     int64_t size = 0;
     std::vector<float> tau, before;
 
     explicit Ray(int64_t slots) : tau(slots + WIDTH), before(slots + WIDTH) {}
 
-    // Returns the optical depth of all.
+    // Returns the total optical depth.
     float take(const float* taus, const bool* valid, const float* skipped, int64_t slots) {
         for (size = slots; size > 0 && !valid[size - 1];) size--;
         std::fill(tau.begin() + size, tau.end(), 0.0f);

@@ -15,12 +15,12 @@ from mmpi_ns.ops.composite import Composite, compiled_weights
 from mmpi_ns.ops.gpu_scene import block_size, launch, one_minus_exp
 
 NUMBERS = 512
-"""Slots of a program."""
+"""Slots per program."""
 
 
 @triton.jit
 def slots_of(row, num_rays, slots, SLOTS: tl.constexpr, BLOCK: tl.constexpr):
-    """Rays of a program, their slots, where these are, and which exist."""
+    """Rays of a program, their slots, the addresses of these, and which exist."""
     ray, slot = (row * BLOCK + tl.arange(0, BLOCK))[:, None], tl.arange(0, SLOTS)[None, :]
     return ray, slot, ray.to(tl.int64) * slots + slot, (ray < num_rays) & (slot < slots)
 

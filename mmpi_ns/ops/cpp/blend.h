@@ -1,10 +1,10 @@
-// What reliability makes of a sample's optical depth (blending.log_shares, blend_shares and blended_optical_depth).
+// Optical depth of a sample after blending by reliability (blending.log_shares, blend_shares, blended_optical_depth).
 #pragma once
 #include "crossings.h"
 
 namespace {
 
-// Where a sample of the cube lies.
+// Position of a sample in the cube.
 inline void place_in_cube(const Cube& cube, const Packet& rays, int ray, float t, float* ndc) {
     for (int a = 0; a < 3; a++) {
         const float x = rays.origin[a][ray] + rays.direction[a][ray] * t;
@@ -12,7 +12,7 @@ inline void place_in_cube(const Cube& cube, const Packet& rays, int ray, float t
     }
 }
 
-// Where a sample of a ray lies in head j; false outside its frustum.
+// Position of a sample of a ray in head j; false outside its frustum.
 inline bool place(const Scene& scene, const Packet& rays, const Crossings& crossings, int ray, int64_t j,
                   float inverse_t, float* ndc) {
     if (j < scene.num_mpis) {

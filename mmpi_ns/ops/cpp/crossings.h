@@ -1,5 +1,5 @@
-// Where sixteen rays cross the planes of all MPIs, and the cube. The references, which say why, are geometry.plane_hits
-// and geometry.cube_hits.
+// Intersections of sixteen rays with the planes of all MPIs and the cube. The references, with their derivation, are
+// geometry.plane_hits and geometry.cube_hits.
 #pragma once
 #include "lanes.h"
 #include "scene.h"
@@ -14,8 +14,8 @@ namespace {
 struct Rays {
     const float *origins, *directions; // [R, 3] world
     const float *nears, *fars;         // [R, 1]
-    const bool* heads;                 // [R, H] which may answer a ray; null: all
-    const float* priorities;           // [R, K] of the MPIs, of which only the first that a ray meets answers; null: all do
+    const bool* heads;                 // [R, H] which may render a ray; null: all
+    const float* priorities;           // [R, K]; the intersected MPI of highest priority renders; null: all
 };
 
 // Sixteen rays; those beyond the last one are its copies, and not `there`.
@@ -44,7 +44,7 @@ inline Lanes floored(Lanes x) {
     return pick(whole > x, whole - 1.0f, whole);
 }
 
-// The planes of one MPI that rays meet: `count` of them from `first` on, counted from the last plane of the MPI.
+// The intersected planes of one MPI: `count` of them from `first` on, counted from the last plane of the MPI.
 struct Crossing {
     IntLanes first, count;
     Lanes u, u_slope, v, v_slope; // tangents on the plane of disparity w: u + w u_slope
@@ -57,7 +57,7 @@ struct Crossing {
             const float* axis = mpi.axes[a];
             origin[a] = axis[0] * (rays.origin[0] - mpi.origin[0]) + axis[1] * (rays.origin[1] - mpi.origin[1]) +
                         axis[2] * (rays.origin[2] - mpi.origin[2]);
-            const int i = a < 2; // which product is rounded: as in all scenes trained so far, to the bit
+            const int i = a < 2; // fixes which product is rounded, and so the bits of results
             direction[a] = axis[i] * rays.direction[i] + axis[1 - i] * rays.direction[1 - i] + axis[2] * rays.direction[2];
         }
         const Lanes oz = origin[2], dz = direction[2];
@@ -86,7 +86,7 @@ struct Crossing {
             for (int i = 0; i < 6; i++) all &= p[i] * w <= q[i];
             return all;
         };
-        // The division may be off by one plane at a border: the half-space test itself decides.
+        // The division may be off by one plane at a border, so the half-space test decides.
         high = pick(intersected(high + 1), high + 1, pick(intersected(high), high, high - 1));
         low = pick(intersected(low - 1), low - 1, pick(intersected(low), low, low + 1));
         first = truncated(high);
@@ -123,7 +123,7 @@ struct CubeCrossing {
     }
 };
 
-// The samples of sixteen rays in the heads that may answer them.
+// The samples of sixteen rays in the allowed heads.
 struct Crossings {
     std::vector<Crossing> mpis;
     CubeCrossing cube;

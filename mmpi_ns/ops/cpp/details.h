@@ -1,12 +1,12 @@
-// How much a training image counts where it shows the surface of a ray. C++ and GLSL both read this file: the page's
-// shader has it at its head (export/web.py), and Python reads its numbers (ops/details).
+// Weight of a training image at the surface of a ray. C++ and GLSL both read this file: it stands at the head of the
+// page's shader (export/web.py), and Python reads its numbers (ops/details).
 const float TURN = 0.01;        // angle of viewing directions below which weights hardly grow, radians
-const float FADE = 0.2;         // angle at which half of a difference is left, radians
+const float FADE = 0.2;         // angle at which a residual fades to a half, radians
 const float SAME_DEPTH = 0.05;  // relative difference of inverse depths within which two images show one surface
 const float SAME_PIXELS = 0.5;  // ... or displacement by their difference, pixels
-const float STRENGTH = 1.1;     // a field fits its training images better than others, which lack more
-const float HERE = 0.25;        // share of a difference that is from the image being rendered, not from its own rendering
-const float MIDDLE = 0.5;       // radiance from which both are counted, so that stored differences stay small
+const float STRENGTH = 1.1;     // above 1, because other views lack more than the training images
+const float HERE = 0.25;        // share of a residual against the image being rendered, not against its own rendering
+const float MIDDLE = 0.5;       // radiance subtracted from both, so that stored residuals stay small
 const float LEAST_WEIGHT = 0.1; // total weight of training images below which details fade
 const float TINY = 1e-9;
 
@@ -18,5 +18,5 @@ float agreement(float there, float here, float shift, float turn) {
     return exp(-min(apart * apart, float(80))) / (turn + TURN);
 }
 
-// What is left of a difference at an angle. From the side surfaces look different, and wrong depths displace details.
+// Share of a residual at an angle. From the side, surfaces look different, and wrong depths displace details.
 float faded(float turn) { return float(1) / (float(1) + turn / FADE * (turn / FADE)); }

@@ -50,12 +50,12 @@ inline float largest(Lanes x) {
 #endif
     float each[WIDTH];
     __builtin_memcpy(each, &x, sizeof each);
-    float found = each[0];
-    for (int i = 1; i < WIDTH; i++) found = each[i] > found ? each[i] : found;
-    return found;
+    float highest = each[0];
+    for (int i = 1; i < WIDTH; i++) highest = each[i] > highest ? each[i] : highest;
+    return highest;
 }
 
-// What a function of each lane's number gives.
+// Values of a function of each lane's number.
 template <typename To, typename F> inline To each_lane(IntLanes x, F f) {
     int32_t from[WIDTH];
     decltype(f(from[0])) to[WIDTH];
@@ -95,7 +95,7 @@ inline Lanes gather(const float* table, IntLanes at) {
     return each_lane<Lanes>(at, [table](int32_t i) { return table[i]; });
 }
 
-// 1 / x to 1e-7, of what is at least 1e-12.
+// 1 / x to 1e-7, for x >= 1e-12.
 inline Lanes reciprocal(Lanes x) {
 #ifdef __AVX512F__
     const Lanes rough = Lanes(_mm512_rcp14_ps(__m512(x)));
@@ -104,7 +104,7 @@ inline Lanes reciprocal(Lanes x) {
     return 1.0f / x;
 }
 
-// 1 / sqrt(x) to 1e-6, of what is at least 1e-20.
+// 1 / sqrt(x) to 1e-6, for x >= 1e-20.
 inline Lanes inverse_root(Lanes x) {
 #ifdef __AVX512F__
     const Lanes rough = Lanes(_mm512_rsqrt14_ps(__m512(x)));
@@ -116,7 +116,7 @@ inline Lanes inverse_root(Lanes x) {
 inline void store(float* to, Lanes x) { __builtin_memcpy(to, &x, sizeof x); }
 inline void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
 
-// The first `count` of sixteen numbers, the others 0; and where they go. At most sixteen, without a call for all.
+// Loads and stores of the first `count` of sixteen numbers; the others are 0.
 template <typename To, typename From> inline To load_some(const From* from, int64_t count) {
     To x{};
     static_assert(sizeof x == WIDTH * sizeof *from, "sixteen numbers");

@@ -1,4 +1,4 @@
-// Parts of an operation, each by a thread. Whatever a part is, an operation writes the same bits for any number of them.
+// Parts of an operation, each by a thread. An operation writes the same bits for any number of parts.
 #pragma once
 #include <algorithm>
 #include <atomic>
@@ -19,10 +19,10 @@ inline void relax() { std::atomic_signal_fence(std::memory_order_seq_cst); }
 // Number of the part that this thread works on.
 inline thread_local int64_t this_part = 0;
 
-// Jobs that may be left to other threads at once; one more waits for the oldest.
+// Jobs that may be pending in other threads; a further one waits for the oldest.
 constexpr int64_t LATER = 4;
 
-// The parts of one job. Whoever is there first takes the next one.
+// The parts of one job, taken first come, first served.
 class Parts {
     static constexpr uint64_t ONE = 1; // a ticket: number of the job, its parts, the next of them
     std::atomic<uint64_t> ticket{0};
@@ -37,7 +37,7 @@ class Parts {
         return (now & MOST) < (now >> 16 & MOST);
     }
 
-    // Works on one part, if one is left.
+    // Works on one part, if any remains.
     bool take() {
         uint64_t now = ticket.load();
         while ((now & MOST) < (now >> 16 & MOST)) {
@@ -57,7 +57,7 @@ class Parts {
         ticket.store(((ticket.load() >> 32) + 1) << 32 | uint64_t(parts) << 16);
     }
 
-    // Works on what is left and waits for the parts of others, meanwhile on whatever `otherwise` finds.
+    // Works on the remaining parts and waits for those of others, meanwhile working on other jobs (`otherwise`).
     template <class Otherwise> void finish(const Otherwise& otherwise) {
         while (take()) {}
         for (int spins = 0; unfinished.load();)
@@ -66,8 +66,8 @@ class Parts {
 };
 
 // Threads that wait for parts: awake for a moment, since a step has dozens of operations, then asleep. The caller takes
-// parts, too, so nobody waits for a thread that has no core. Threads that have no part of an operation that is waited
-// for work on those that are not, in the order in which they came.
+// parts too, so a thread without a core delays nothing. Threads without a part of an urgent operation work on pending
+// jobs, in the order in which they came.
 class Crew {
     static constexpr auto AWAKE = std::chrono::microseconds(100);
 
@@ -116,7 +116,7 @@ class Crew {
     }
 
   public:
-    // each(part) for all parts. One caller at a time has the threads; another, and a process that was forked and has
+    // each(part) for all parts. One caller at a time has the threads; a second caller, and a forked process, which has
     // none, works alone.
     template <class Each> void run(int64_t parts, const Each& each) {
         std::unique_lock<std::mutex> mine(one_caller, std::defer_lock);
@@ -129,7 +129,7 @@ class Crew {
         urgent.finish([this] { return take_later(); });
     }
 
-    // Leaves each(part) for all parts, at most MOST, to so many other threads. Returns the job's number for `finish`.
+    // Hands each(part) for all parts, at most MOST, to other threads. Returns the job's number for `finish`.
     template <class Each> int64_t leave(int64_t parts, int64_t helpers, const Each& each) {
         const std::lock_guard<std::mutex> mine(one_leaver);
         const int64_t number = oldest.load();
@@ -144,14 +144,14 @@ class Crew {
         return number;
     }
 
-    // Returns when a job that was left is finished. In a forked process no other thread would finish its parts.
+    // Waits for a pending job. In a forked process no other thread would finish its parts.
     void finish(int64_t number) {
         if (!is_forked()) later[number].finish([] { return false; });
     }
 };
 
 inline Crew& crew() {
-    static Crew* all = new Crew; // never destroyed: its threads live as long as the process
+    static Crew* all = new Crew; // never destroyed: its threads run until the process ends
     return *all;
 }
 
@@ -170,7 +170,7 @@ template <class... A, void (*F)(int64_t, int64_t, A...)> struct InParts<F> {
 
 // Makes an operation of (begin, end, ...) callable for all parts between bounds (ops/build.call_in_parts).
 #define IN_PARTS(NAME) extern "C" { void* NAME##_in_parts = reinterpret_cast<void*>(&InParts<&NAME>::run); }
-// And one that may be left to other threads (ops/build.leave_in_parts).
+// The same for one that other threads may run later (ops/build.leave_in_parts).
 #define LATER_IN_PARTS(NAME)                                                                                           \
     extern "C" {                                                                                                       \
     void* NAME##_later = reinterpret_cast<void*>(&InParts<&NAME>::leave);                                              \

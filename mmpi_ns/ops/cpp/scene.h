@@ -1,4 +1,4 @@
-// What the kernels know of a plan: MPIs first, the cube last. Filled by ops/layout.py, field by field.
+// Plan data of the kernels: MPIs first, the cube last. Filled by ops/layout.py, field by field.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -66,7 +66,7 @@ struct Cell {
     }
 };
 
-// Rows of the four texels around a place on a plane, and whether anything is stored there.
+// Rows of the four texels around a position on a plane, and whether any is stored.
 struct Corners {
     int64_t row[4]; // (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)
     bool stored;

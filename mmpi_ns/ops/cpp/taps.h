@@ -1,4 +1,4 @@
-// The texels that a sample reads, and what they hold.
+// The texels that a sample reads, and their values.
 #pragma once
 #include "scene.h"
 #include "table.h"
@@ -49,8 +49,7 @@ struct Texel {
     Lanes value, slope;
 };
 
-// Colours are sigmoids and features hyperbolic tangents, of sixteen numbers of these channels. What is not a number stays
-// so.
+// Colours are sigmoids and features hyperbolic tangents, of sixteen numbers of these channels. NaN stays NaN.
 inline Texel activate(Lanes raw, Lanes channels) {
     const Mask is_color = channels < float(COLORS);
     const Lanes share = 1.0f / (1.0f + exp_lanes(is_color ? -raw : -2.0f * raw));

@@ -1,11 +1,11 @@
-// One walk for all pictures: sixteen rays abreast through all heads, near to far, from one brick that holds something to
-// the next, until each terminates; then what the samples that weigh enough hold, ray by ray. Templated on how texels are
-// stored: as floats in the bricks of training (march/render.cpp) or as bytes in baked bricks (baked/baked.cpp).
+// The walk of all images: sixteen rays abreast through all heads, near to far, from one stored brick to the next, until
+// each terminates; then the values of the kept samples, ray by ray. Templated on the storage of texels: floats in the
+// bricks of training (march/render.cpp) or bytes in baked bricks (baked/baked.cpp).
 //
-// What a walk is made of, and what training (march/march.cpp) shares:
-//   ends.h       when a ray terminates and what its depth is; the page's shader reads it too
-//   crossings.h  which planes of which heads a ray meets
-//   blend.h      what reliability makes of a sample
+// Parts of a walk, shared with training (march/march.cpp):
+//   ends.h       termination and depth of a ray; the page's shader reads it too
+//   crossings.h  intersected planes of all heads
+//   blend.h      blending by reliability
 //   here         stepping abreast, and sums
 // Training steps otherwise, one ray at a time and each head's samples in blocks: its rays are drawn at random, so sixteen
 // of them go different ways. Abreast, 4,096 of them take 2.2 times as long (40 instead of 18 ms, next to nothing kept), and
@@ -24,7 +24,7 @@ struct Column {
     int32_t first;  // brick of the lowest bit; the others follow it
 };
 
-// The planes of one MPI, and where texels and columns are on them.
+// The planes of one MPI, with the coordinates of their texels and columns.
 struct Stack {
     float step, end;        // disparity between planes and of the last one
     float u0, v0;           // texel = (u - u0) x_scale
@@ -47,7 +47,7 @@ template <int CELLS> struct Walks {
     IntLanes exit, last, plane, brick, word;
     IntLanes ahead; // planes of the column that are still to come
 
-    // Rays of `going` set out.
+    // Starts the rays of `going`.
     void begin(const Column* columns, const Stack& stack, const Crossing& at, Mask going) {
         x_last = (at.u + stack.end * at.u_slope - stack.u0) * stack.x_scale;
         y_last = (at.v + stack.end * at.v_slope - stack.v0) * stack.y_scale;
@@ -59,7 +59,7 @@ template <int CELLS> struct Walks {
         next(columns, stack, going & (at.count > 0));
     }
 
-    // Rays of `going` go on to the next plane that holds something.
+    // Advances the rays of `going` to the next occupied plane.
     void next(const Column* columns, const Stack& stack, Mask going) {
         for (;;) {
             const IntLanes l = exit + 1;
@@ -93,7 +93,7 @@ template <int CELLS> struct Walks {
         return cell;
     }
 
-    // Looks up the columns that rays enter at planes l, and how far each goes in its own.
+    // Looks up the columns that rays enter at planes l, and the plane at which each ray leaves its column.
     void search(const Column* columns, const Stack& stack, IntLanes l, Mask searching) {
         const Lanes back = real(l - (stack.planes - 1));
         const IntLanes across = pick(searching, tile(x_last + back * x_step, stack.across), IntLanes{});
@@ -136,7 +136,7 @@ struct CubeWalks {
     }
 };
 
-// Which samples of a ray are kept, and where it ends.
+// Bounds for keeping samples and for termination.
 struct Bounds {
     float weight, transmittance; // what a kept sample exceeds, and at which a ray terminates
 
@@ -172,7 +172,7 @@ template <typename Texels> class Walker {
   private:
     using Reads = typename Texels::Reads;
 
-    // A sample that weighs enough.
+    // A kept sample.
     struct Seen {
         float weight, inverse_t;
         int32_t head;
@@ -209,8 +209,8 @@ template <typename Texels> class Walker {
         }
     }
 
-    // The ray that is least far on its way goes first, with all that wait for the same head: so they stay abreast, and
-    // each meets its own samples in its own order.
+    // The ray with the nearest next sample goes first, with all rays whose next sample is in the same head: so they
+    // stay abreast, and each takes its samples in order.
     void walk(const Packet& packet) {
         for (;;) {
             Lanes top = next(0);
@@ -227,7 +227,7 @@ template <typename Texels> class Walker {
         }
     }
 
-    // Rays of `going` take their next sample of one head.
+    // Takes the next sample of one head for the rays of `going`.
     void step(int32_t h, Mask going, const Packet& packet) {
         const Lanes inverse_t = next(h);
         Reads reads;
@@ -249,7 +249,7 @@ template <typename Texels> class Walker {
         const Mask kept = going & (weight > least_weight);
         for (uint32_t lanes = bits(kept); lanes; lanes &= lanes - 1) {
             const int i = __builtin_ctz(lanes);
-            Seen& sample = seen[i].emplace_back(); // written in place: a copy would wait for what was just stored
+            Seen& sample = seen[i].emplace_back(); // written in place: a copy would wait for the store
             sample.weight = weight[i], sample.inverse_t = inverse_t[i], sample.head = h;
             texels.look_up(reads, i, sample.lookup);
         }
@@ -293,7 +293,7 @@ template <typename Texels> class Walker {
         __builtin_memcpy(to, &total, sizeof total);
     }
 
-    // What a ray gathered, its depth, and the head that gave most.
+    // Sums of a ray, its depth, and its head of largest weight.
     void sum(const std::vector<Seen>& samples, int64_t ray, const Outputs& to) {
         if (texels.channels == OCTET)
             gather_pairs(samples, to.gathered + ray * OCTET);

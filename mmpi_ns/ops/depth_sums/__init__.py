@@ -1,4 +1,4 @@
-"""What the losses of depth need of a ray's samples: the spread of its weights, and their mass near a known depth."""
+"""Sums over a ray's samples for the depth losses: the spread of its weights, and their mass near a depth prior."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class DepthSums(NamedTuple):
     mass: Float[Tensor, "R"]
     """sum_i w_i exp(-1/2 ((1/t_i - target) / width)^2)."""
     reached: Bool[Tensor, "R"]
-    """Whether a sample lies within three widths of the target, and there is one."""
+    """Whether the ray has a target and a sample within three widths of it."""
 
 
 @operation("gpu")
@@ -45,7 +45,7 @@ def depth_sums(
         inverse_t: inverse distances of the samples, front to back.
         valid: which slots hold a sample.
         intervals: delta, the length of a ray's samples on the map s.
-        targets: inverse distance at which mass counts, 0 for none, and the width of the window round it (> 0).
+        targets: inverse distance of the depth prior, 0 for none, and the width of the window around it (> 0).
         scale: distance that s maps to 1/2.
 
     Source: spread: mip-NeRF 360 eq. (15), in O(S) a ray by prefix sums as in DVGO v2.

@@ -18,7 +18,7 @@ REACH = tl.constexpr(definition.REACH)
 
 @triton.jit
 def _around(weights, inverse_ts, at, inside, scale):
-    """Weights of neighbours, and the same times their positions."""
+    """Weights of neighbours, and their products with positions."""
     weight = tl.load(weights + at, inside, 0.0)
     return weight, weight / (1 + scale * tl.load(inverse_ts + at, inside, 0.0))
 

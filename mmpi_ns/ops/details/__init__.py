@@ -1,4 +1,4 @@
-"""What a training image shows of the surfaces that rays end at, and how much it counts there."""
+"""Residuals of a training image at the surfaces of rays, and their weights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import numbers_in
 
 TEXT = (HEADERS / "details.h").read_text(encoding="utf-8")
-"""Lines that both C++ and GLSL understand: the numbers below with what they mean, and the weights."""
+"""Source of the constants and weights, valid in C++ and GLSL."""
 TURN, FADE, SAME_DEPTH, SAME_PIXELS, STRENGTH, HERE, MIDDLE, LEAST_WEIGHT, TINY = numbers_in(
     TEXT, "TURN", "FADE", "SAME_DEPTH", "SAME_PIXELS", "STRENGTH", "HERE", "MIDDLE", "LEAST_WEIGHT", "TINY"
 )
@@ -25,7 +25,7 @@ class SeenDetails(NamedTuple):
 
     difference: Float[Tensor, "R 3"]
     weight: Float[Tensor, "R 1"]
-    """0 where the image shows another surface, or none."""
+    """0 where the image sees another surface, or none."""
 
 
 def project(
@@ -63,8 +63,8 @@ def seen_details(
     image: Float[Tensor, "H W 4"],
     camera: Float[Tensor, "24"],
 ) -> SeenDetails:
-    """The differences of an image, interpolated, where it shows the surfaces of rays. The less the viewing direction
-    differs, the more they weigh and the less they fade; and the better the depths agree, the more they weigh.
+    """Interpolated residuals of an image where it sees the surfaces of rays. Weights grow with the agreement of viewing
+    directions and depths; residuals fade with the angle between the directions.
 
     Args:
         origins: of the rays.

@@ -1,4 +1,4 @@
-// What a training image shows of the surfaces that rays end at, and how much it counts there.
+// Residuals of a training image at the surfaces of rays, and their weights.
 #include "parts.h"
 
 #include <algorithm>
@@ -16,7 +16,7 @@ float norm(const float* v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] *
 struct Camera {
     float pose[12], fx, fy, cx, cy, k1, k2, k3, k4, p1, p2, fisheye, reach;
 
-    // Pixel of a direction in world axes; false if the image does not have it.
+    // Pixel of a direction in world axes; false outside the image.
     bool project(const float* direction, int64_t height, int64_t width, float& column, float& row) const {
         float local[3];
         for (int i = 0; i < 3; i++)
@@ -33,7 +33,7 @@ struct Camera {
     }
 };
 
-// Four values of an image at a pixel coordinate, interpolated; centres are at halves, and beyond them are the borders.
+// Four interpolated values of an image at a pixel coordinate; pixel centres are at halves, and borders are repeated.
 void look_up(const float* image, int64_t height, int64_t width, float column, float row, float* values) {
     const float x = std::clamp(column - 0.5f, 0.0f, float(width - 1)), y = std::clamp(row - 0.5f, 0.0f, float(height - 1));
     const int64_t left = int64_t(x), top = int64_t(y);

@@ -1,7 +1,7 @@
-"""What rays gather of the texels along them: sums of rendering weight times colour and features.
+"""Sums along rays of rendering weight times colour and features.
 
-A texel's first three channels are logits of a colour, the others arguments of features. Both are interpolated raw; a
-sample has the sigmoids of the first and the hyperbolic tangents of the others.
+The first three channels of a texel are logits of a colour, the others arguments of features. Both are interpolated raw;
+a sample has the sigmoids of the former and the hyperbolic tangents of the latter.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ COLORS = 3
 
 @dataclass(frozen=True)
 class Taps:
-    """Texels that samples read: 4 each of planes, or 8 each of the cube."""
+    """Texels that samples read: 4 per sample on planes, or 8 per sample of the cube."""
 
     positions: Int[Tensor, "N B"]
-    """Of the texels in the list of values that is read."""
+    """Of the texels in the list of values."""
     weights: Float[Tensor, "N B"]
-    """Of the texels in what is interpolated."""
+    """Of the interpolation."""
 
 
 @dataclass(frozen=True)
 class RaySums:
-    """Sums over the samples of each ray. ``mass``, ``first`` and ``second`` hold the weights fixed."""
+    """Sums over the samples of each ray, of which ``mass``, ``first`` and ``second`` hold the weights fixed."""
 
     gathered: Float[Tensor, "R C"]
-    """Of weight times colour and features."""
+    """Sum of weight times colour and features."""
     mass: Float[Tensor, "R 1"]
-    """Of weight."""
+    """Sum of weight."""
     first: Float[Tensor, "R 3"]
-    """Of weight times colour."""
+    """Sum of weight times colour."""
     second: Float[Tensor, "R 3"]
-    """Of weight times squared colour."""
+    """Sum of weight times squared colour."""
 
 
 def activate(raw: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
@@ -88,8 +88,8 @@ def gather_taps(
 def gather_places(
     layout: SceneLayout, table: Float[Tensor, "T C"], places: Places, weights: Float[Tensor, "R S"]
 ) -> RaySums:
-    """Sums over samples at places in the heads, without gradients; ``table`` holds all texels. In plain torch alone:
-    pictures are made by ``ops.march``."""
+    """Sums over samples at places in the heads, without gradients; ``table`` holds all texels. In plain torch only:
+    ``ops.march`` renders images."""
     slots, raw = zip(*interpolated(layout, table, places), strict=True)
     return _sums(torch.cat(raw), torch.cat(slots), weights)
 
@@ -97,7 +97,7 @@ def gather_places(
 def interpolated(
     layout: SceneLayout, table: Float[Tensor, "T C"], places: Places
 ) -> Iterator[tuple[Int[Tensor, "N"], Float[Tensor, "N C"]]]:
-    """Of each head the flat slots of its samples, and what the table holds at their places."""
+    """Flat slots of the samples of each head, and the interpolated values of the table there."""
     for k, grid in enumerate(layout.grids):
         slots = (places.valid & (places.heads == k)).reshape(-1).nonzero()[:, 0]
         ndc, planes = places.ndc.reshape(-1, 3)[slots], places.planes.reshape(-1)[slots]
@@ -117,7 +117,7 @@ def _sums(raw: Tensor, slots: Tensor, weights: Tensor) -> RaySums:
 LANES = 16
 """Gradients of sums are padded to multiples of this many channels."""
 AT_LEAST = 1 << 14
-"""Texels read that are worth another thread."""
+"""Texels read that justify another thread."""
 
 
 def _groups(taps: list[Tensor], to_weights: Sequence[Tensor | None] = (None, None)) -> ctypes.Array:
@@ -163,6 +163,6 @@ class _GatherTaps(torch.autograd.Function):
 
 @gather_taps.on_cpu
 def gather_taps_on_cpu(values: Tensor, taps: list[Taps], slots: Tensor, weights: Tensor, chosen: Tensor) -> RaySums:
-    """Gradients do not depend on the number of threads."""
+    """``gather_taps`` in C++, whose gradients do not depend on the number of threads."""
     tensors = [x for t in taps for x in (t.positions.to(torch.int32), t.weights)]
     return RaySums(*_GatherTaps.apply(values, weights, slots, chosen, *tensors))  # type: ignore[misc]

@@ -1,4 +1,4 @@
-// What rays gather of the texels along them, and its gradients.
+// Sums along rays of weight times colour and features, and their gradients.
 #include "parts.h"
 #include "taps.h"
 
@@ -11,10 +11,10 @@ struct Taps {
     const int32_t* positions;
     const float* weights;
     int64_t count;
-    float* grad_weights; // null: not asked for
+    float* grad_weights; // null: not needed
 };
 
-// A sample's part of them.
+// The taps of one sample.
 struct SampleTaps {
     int taps;
     const int32_t* positions;
@@ -38,7 +38,7 @@ struct SampleTaps {
     }
 };
 
-// Sums over a ray's samples: weight times what their texels hold, weight, weight times squared colour.
+// Sums over a ray's samples: weight times texel values, weight, weight times squared colour.
 void gather(const Table& table, const std::vector<Sample>& samples, float* sums) {
     float mass = 0;
     Lanes squares{};
@@ -55,8 +55,8 @@ void gather(const Table& table, const std::vector<Sample>& samples, float* sums)
     for (int c = 0; c < COLORS; c++) sums[table.channels + 1 + c] = squares[c];
 }
 
-// Sums [R, channels + 4] of rays [begin, end): `numbers` [R, S] says which sample is in a slot, -1 if there is none. The
-// next ray's memory is asked for before one is summed.
+// Sums [R, channels + 4] of rays [begin, end): `numbers` [R, S] is the sample in each slot, -1 if there is none. The
+// memory of the next ray is prefetched.
 void mmpi_gather_taps(int64_t begin, int64_t end, const float* values, int64_t rows, int64_t channels,
                       const Taps* groups, const int32_t* numbers, const float* weights, int64_t slots, float* sums) {
     const Table table{values, rows, channels};
@@ -84,11 +84,11 @@ void mmpi_number_samples(int64_t begin, int64_t end, const int64_t* slots, const
         if (chosen[slots[n] / slots_per_ray]) numbers[slots[n]] = int32_t(n);
 }
 
-// Gradients of values [rows, channels] (null if not asked for), of the taps' weights (in the taps, added to what is there)
+// Gradients of values [rows, channels] (null if not needed), of the taps' weights (in the taps, added to what is there)
 // and of weights [R, S] from those of the sums [R, padded] and, except for the weights, of the sums of
 // colours and twice those of squared colours [R, 16], padded with zeros. Samples of rays that are not `chosen` have none.
-// Rows [begin, end) have one owner, who adds the samples in the order of `slots`: sums do not depend on the threads. The
-// owner of a sample's first row writes the other gradients.
+// One thread owns rows [begin, end) and adds the samples in the order of `slots`: sums do not depend on the threads.
+// The owner of a sample's first row writes the other gradients.
 void mmpi_gather_back(int64_t begin, int64_t end, const float* values, int64_t rows, int64_t channels,
                       const Taps* groups, const int64_t* slots, const bool* chosen, const float* weights,
                       const float* grad_sums, const float* grad_colors, const float* grad_squares,

@@ -1,5 +1,4 @@
-"""What rays gather of the texels along them, on a GPU. Gradients of texels are atomic sums: their last bits may differ
-from run to run."""
+"""Sums along rays on a GPU. Gradients of texels are atomic sums, so their last bits may differ from run to run."""
 
 # Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
@@ -16,7 +15,7 @@ from mmpi_ns.ops.gather import COLORS, RaySums, Taps
 from mmpi_ns.ops.gpu_scene import block_size, launch
 
 NUMBERS = 512
-"""Rays, or samples, of a program, times their channels: what its registers hold."""
+"""Rays or samples per program times their channels, limited by its registers."""
 
 
 @triton.jit
@@ -38,14 +37,14 @@ def _read_taps(values, positions, shares, number, inside, channels, column, TAPS
     return raw
 
 
-# Arrays that are parts of others begin anywhere, and no variant is compiled for those that happen to be aligned.
+# Slices of arrays begin at any address, and no variant is compiled for aligned ones.
 @triton.jit(do_not_specialize=("num_rays", "slots", "planar", "positions", "shares", "cube_positions", "cube_shares"))
 def gather_kernel(
     values, numbers, weights, positions, shares, cube_positions, cube_shares, sums, num_rays, slots, channels, planar,
     HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sums over samples of weight times texel, of weight, and of weight times squared colour. ``numbers`` says which
-    sample a slot holds; the first ``planar`` are on planes."""
+    """Sums over samples of weight times texel, of weight, and of weight times squared colour. ``numbers`` is the
+    sample in each slot; the first ``planar`` are on planes."""
     ray, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
     inside = ray < num_rays
     mass = ray * 0.0
@@ -98,7 +97,7 @@ def gather_back_kernel(
             at = row[:, None] * channels + column
             if NEEDED:
                 share = tl.load(shares + number * TAPS + tap, inside, 0.0)
-                # What adds nothing is left out: all samples that fill up a capacity have the same few texels.
+                # Zero terms are skipped: all samples that pad a capacity read the same few texels.
                 tl.atomic_add(to_values + at, share[:, None] * down, filled & (down != 0), sem="relaxed")
             if MOVED:
                 read = tl.load(values + at, filled, 0.0)
@@ -106,8 +105,8 @@ def gather_back_kernel(
 
 
 def sizes(channels: int, device: torch.device, numbers: int = NUMBERS) -> tuple[int, int, int]:
-    """Columns, rays or samples, and warps of a program that holds so many numbers: a lane for each ray or sample, so
-    that none repeats what another does."""
+    """Columns, rays or samples, and warps of a program that holds this many numbers; a lane for each ray or sample,
+    without repeated work."""
     columns = max(4, int(triton.next_power_of_2(channels)))  # colours take three, however few there are
     block = block_size(max(8, numbers // columns), device)
     return columns, block, min(4, max(1, block // 32))

@@ -1,6 +1,6 @@
-"""Rows of tables: which of them a batch reads, weighted sums of those, and the gradients of the rows that were read.
+"""Rows of tables that a batch reads, their weighted sums, and their gradients.
 
-A table has millions of rows of which a step reads a few: backward and optimiser follow those, never the table's size.
+A step reads a few of a table's millions of rows. The cost of backward and optimiser follows those, not the table.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
 AT_LEAST = 1 << 15
-"""Entries, samples or bricks that are worth another thread, whose start takes as long as a tenth of a millisecond."""
+"""Entries, samples or bricks that justify another thread, whose start takes a tenth of a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -27,31 +27,31 @@ class RowIndex:
     """Distinct rows of a list, and the place of every entry among them."""
 
     unique: Int[Tensor, "U"]
-    """Rising, except for padding."""
+    """Ascending, except for padding."""
     positions: Int[Tensor, "..."]
-    """Of every entry in ``unique``; int32 or int64."""
+    """Index of every entry in ``unique``; int32 or int64."""
     count: Int[Tensor, ""] | None = None
-    """How many distinct rows there are, if there was room for so many alone."""
+    """Number of distinct rows, if a limit was given."""
 
 
 class Table(nn.Parameter):
-    """A parameter of T rows, whose gradient is that of the rows that were read: ``grad`` [U, C] of ``grad_rows`` [U].
+    """A parameter of T rows with a gradient of the rows that were read: ``grad`` [U, C] of ``grad_rows`` [U].
 
-    ``read_rows`` brings the gradient and ``TouchedAdam`` takes it. Whatever treats gradients number by number works as
-    with any parameter: dropping, scaling, clipping and norms, in torch and in nerfstudio.
+    ``read_rows`` adds to the gradient and ``TouchedAdam`` uses it. Elementwise treatment of gradients works as with any
+    parameter: dropping, scaling, clipping and norms, in torch and in nerfstudio.
 
-    The optimiser may leave its step to other threads. ``data``, ``detach`` and ``read_rows`` wait for it; other
-    operations on the parameter itself do not.
+    Other threads may run the optimiser's step. ``data``, ``detach`` and ``read_rows`` wait for it; other operations on
+    the parameter itself do not.
     """
 
     grad_rows: Int[Tensor, "U"] | None = None
-    """Rising and each once, but that row 0 with a gradient of 0 may follow any number of times."""
+    """Ascending and distinct, but row 0 with a gradient of 0 may follow any number of times."""
     _row_grad: Float[Tensor, "U C"] | None = None
     pending: Pending | None = None
-    """A step of the optimiser that other threads work on."""
+    """Pending step of the optimiser in other threads."""
 
     def settle(self) -> None:
-        """Returns when the optimiser's step is finished."""
+        """Waits for the pending step of the optimiser."""
         if self.pending is not None:
             self.pending.finish()
             self.pending = None
@@ -84,7 +84,7 @@ class Table(nn.Parameter):
         self.grad_rows = self._row_grad = None
 
     def add_grad(self, rows: Int[Tensor, "U"], values: Float[Tensor, "U C"]) -> None:
-        """Adds the gradient of rows in the order of ``grad_rows`` to what is there."""
+        """Adds a gradient, in the order of ``grad_rows``, to the present one."""
         if self.grad_rows is not None and self._row_grad is not None:
             rows, values = torch.cat([self.grad_rows, rows]), torch.cat([self._row_grad, values])
             index, ones = index_rows(rows[:, None], len(self), pads=True), torch.ones_like(values[:, :1])
@@ -101,12 +101,12 @@ def order_by_head(
     Args:
         places: of the samples.
         num_heads: of the scene.
-        counts: samples of each head, if known; otherwise this synchronises with a GPU.
-        pads: ``counts`` is the room for samples of each head; what is left of it refers to the last slot of the first
-            ray, which is empty then. Samples beyond are left out.
+        counts: samples of each head; without it, this synchronises with a GPU.
+        pads: ``counts`` is the capacity of each head; unused places refer to the last slot of the first ray, which is
+            empty then. Samples beyond the capacity are dropped.
 
     Returns:
-        Flat slots [R, S] of the samples, their heads, planes and NDC, and how many there are of each head.
+        Flat slots [R, S] of the samples, their heads, planes and NDC, and the number of samples of each head.
     """
     heads, valid = places.heads.reshape(-1), places.valid.reshape(-1)
     if counts is None:
@@ -150,14 +150,14 @@ def texel_rows(
 
 @operation()
 def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False, most: int | None = None) -> RowIndex:
-    """Distinct rows of a list, rising.
+    """Distinct rows of a list, ascending.
 
     Args:
         rows: the list.
         table_rows: rows of the table.
-        pads: row 0, which no entry refers to there, may follow the distinct rows any number of times. A GPU then
-            need not be waited for to tell their number.
-        most: room for so many distinct rows alone, padded likewise; entries of further ones refer to the last.
+        pads: row 0, which no entry refers to there, may follow the distinct rows any number of times, which avoids
+            synchronisation with a GPU.
+        most: limit on the number of distinct rows, padded likewise; entries of further rows refer to the last one.
     """
     listed, order = rows.reshape(-1).sort()
     place = torch.diff(listed, prepend=listed[:1]).ne(0).cumsum(0)
@@ -175,7 +175,7 @@ def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False, mo
 def sum_rows(
     positions: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"], count: int
 ) -> Float[Tensor, "U C"]:
-    """For each of ``count`` rows the sum of weights[n, b] values[n] over the entries of ``positions`` that refer to it.
+    """Sum, for each of ``count`` rows, of weights[n, b] values[n] over the entries of ``positions`` that refer to it.
 
     On a CPU a row's entries are added in order, for any number of threads. On a GPU sums are atomic, so their last bits
     may differ from run to run.
@@ -226,7 +226,7 @@ def interpolate(
 def interpolate_densely(
     table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
-    """``interpolate`` as it is defined, with a dense gradient."""
+    """Definition of ``interpolate``, with a dense gradient."""
     return (table[rows] * weights[..., None]).sum(1)
 
 

@@ -1,11 +1,11 @@
-// Rows of tables that a batch reads: which, what is there, and their gradients.
+// Rows of tables that a batch reads: their numbers, values and gradients.
 #include "parts.h"
 #include "taps.h"
 
 namespace {
 
-// Distinct values of `rows`, none negative, in four steps of which each may be done in parts by several threads: every
-// brick has a word of 64 bits, all 0 before the first step, and only the words are read of bricks that no row lies in.
+// Distinct values of `rows`, none negative, in four steps, each in parts by several threads. Every brick has a word of
+// 64 bits, all 0 before the first step; of bricks without a row only the word is read.
 
 // Sets the bits of rows [begin, end) of a list.
 void mmpi_mark_rows(int64_t begin, int64_t end, const int64_t* rows, uint64_t* words) {
@@ -16,15 +16,15 @@ void mmpi_mark_rows(int64_t begin, int64_t end, const int64_t* rows, uint64_t* w
     }
 }
 
-// How many rows are marked in bricks [begin, end), to the part's place in `counts`.
+// Number of marked rows in bricks [begin, end), to the part's place in `counts`.
 void mmpi_count_rows(int64_t begin, int64_t end, const uint64_t* words, int64_t* counts) {
     int64_t count = 0;
     for (int64_t b = begin; b < end; b++) count += __builtin_popcountll(words[b]);
     counts[this_part] = count;
 }
 
-// Lists the marked rows of bricks [begin, end) from the part's place in `starts` on; `before` [bricks] is how many come
-// before a brick's.
+// Lists the marked rows of bricks [begin, end) from the part's place in `starts` on; `before` [bricks] is the number of
+// marked rows in front of a brick.
 void mmpi_list_rows(int64_t begin, int64_t end, const uint64_t* words, const int64_t* starts, int32_t* before,
                     int64_t* unique) {
     int64_t at = starts[this_part];
@@ -43,7 +43,7 @@ void mmpi_place_rows(int64_t begin, int64_t end, const int64_t* rows, const uint
     }
 }
 
-// Rows [begin, end) of a list, read from the table; those that follow each other as one stretch.
+// Rows [begin, end) of a list, read from the table; consecutive ones in one copy.
 void mmpi_take_rows(int64_t begin, int64_t end, const float* table, const int64_t* rows, int64_t, int64_t channels,
                     int64_t, float* values) {
     for (int64_t i = begin, next; i < end; i = next) {
@@ -67,8 +67,8 @@ void mmpi_weighted_rows(int64_t begin, int64_t end, const float* numbers, const 
         }
 }
 
-// values[positions[n, b]] is the sum of weights[n, b] * grad[n], of the entries at positions [begin, end): each has one
-// owner, who adds in the order of samples.
+// values[positions[n, b]] is the sum of weights[n, b] * grad[n], of the entries at positions [begin, end). One
+// thread owns a position and adds in the order of samples.
 void mmpi_sum_rows(int64_t begin, int64_t end, const int32_t* positions, const float* weights, const float* grad,
                    int64_t samples, int64_t taps, int64_t channels, float* values) {
     std::fill(values + begin * channels, values + end * channels, 0.0f);
@@ -77,7 +77,7 @@ void mmpi_sum_rows(int64_t begin, int64_t end, const int32_t* positions, const f
             add_row(values + positions[i] * channels, grad + i / taps * channels, weights[i], channels);
 }
 
-// Adds to the part's `counts` [parts, num_heads] how many of slots [begin, end) hold a sample of each head.
+// Counts the samples of each head in slots [begin, end), to the part's `counts` [parts, num_heads].
 void mmpi_count_heads(int64_t begin, int64_t end, const int64_t* heads, const bool* valid, int64_t num_heads,
                       int64_t* counts) {
     counts += this_part * num_heads;

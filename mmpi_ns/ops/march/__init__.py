@@ -1,7 +1,7 @@
 """Compiled forms of sampling and merging (``mmpi_ns/sampler.py`` defines both in torch): C++ here, Triton in ``gpu``.
 
-They take the nearest of all heads' next samples at each step, and end a ray where less than 1e-5 of its transmittance
-is left (and less than a sample must weigh to be kept), so a ray costs what lies in front of its first surfaces.
+Each step takes the nearest of all heads' next samples. A ray terminates where its transmittance falls below 1e-5 (and
+below the weight of a kept sample), so its cost is that of the samples in front of its first surfaces.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mmpi_ns.scene.columns import columns_from
 
 
 class Rays(NamedTuple):
-    """R rays, and the heads that may answer them."""
+    """R rays, and the heads that may render them."""
 
     origins: Float[Tensor, "R 3"]
     """World axes, scene units."""
@@ -32,16 +32,16 @@ class Rays(NamedTuple):
     fars: Float[Tensor, "R 1"]
     """Distance at which rays end; may be inf."""
     heads: Bool[Tensor, "R H"] | None = None
-    """Heads that may answer each ray; None for all."""
+    """Heads that may render each ray; None for all."""
     priorities: Float[Tensor, "R K"] | None = None
-    """Of the MPIs: each ray is answered by the first one of those it meets (and by the cube). None: by all."""
+    """Priorities of the MPIs: the intersected one of highest priority renders (and the cube). None: all."""
 
 
 class Capacity(NamedTuple):
-    """Room for the samples of a training batch, so that the sizes of its arrays are known before it is marched."""
+    """Capacity for the samples of a training batch, which fixes the sizes of its arrays before the march."""
 
     slots: int
-    """Of each ray; the last one stays empty."""
+    """Slots of each ray; the last one stays empty."""
     heads: tuple[int, ...]
     """Samples of each head."""
     rows: int
@@ -49,20 +49,20 @@ class Capacity(NamedTuple):
 
 
 class MarchOptions(NamedTuple):
-    """Which samples are kept, and how they are blended."""
+    """Pruning and blending of samples."""
 
     threshold: float
-    """Weight below which a sample is dropped; 0 keeps all and ends no ray early."""
+    """Weight below which a sample is pruned; 0 keeps all samples, and no ray terminates early."""
     fair_share: float = float("inf")
     """Bound on the threshold relative to equal weights (``march.prune``)."""
     blends: bool = False
     """Samples are blended by reliability."""
     capacity: Capacity | None = None
-    """On a GPU: the sizes of what is returned, so that nothing is waited for. Samples beyond are left out
-    (``MergedSamples.numbers`` says so). None: as many as there are."""
+    """On a GPU: the sizes of the result, which avoids synchronisation. Samples beyond them are dropped (see
+    ``MergedSamples.numbers``). None: as many as needed."""
 
     def most_kept(self, samples: int) -> int:
-        """How many of a ray's samples are kept at most: weights sum to at most 1, and each exceeds the bound."""
+        """Maximum number of kept samples of a ray: weights sum to at most 1, and each exceeds the bound."""
         if self.threshold <= 0:
             return samples
         return min(samples, int(1.01 / min(self.threshold, self.fair_share / max(samples, 1))) + 2)
@@ -70,7 +70,7 @@ class MarchOptions(NamedTuple):
 
 @dataclass(frozen=True)
 class MergedSamples:
-    """The kept samples of R rays, nearest first in S slots of each ray, and the attenuation by the dropped ones."""
+    """The kept samples of R rays, nearest first in S slots of each ray, and the attenuation by the pruned ones."""
 
     heads: Int[Tensor, "R S"]
     """0 in empty slots, like all fields."""
@@ -91,11 +91,11 @@ class MergedSamples:
     """Whether the allowed heads cover the ray from before the first content out to infinity, or all heads are allowed
     and one is intersected. Such a ray must reproduce its whole pixel."""
     head_counts: tuple[int, ...] | None = None
-    """Samples of each head, if known without synchronising; with a capacity those that there is room for."""
+    """Samples of each head, if available without synchronisation; with a capacity, the capacity of each head."""
     capacity: Capacity | None = None
     """See ``MarchOptions``."""
     numbers: Int[Tensor, "1+H"] | None = None
-    """The most that a ray keeps, then what is kept of each head; with a capacity alone."""
+    """Largest number of kept samples of a ray, then that of each head; only with a capacity."""
 
     @property
     def places(self) -> Places:
@@ -113,7 +113,7 @@ class RayOutputs:
     """Outputs of rays that are rendered in one pass, without arrays of samples."""
 
     gathered: Float[Tensor, "R C"]
-    """Sums of weight times colour and features, of the samples that are kept."""
+    """Sums of weight times colour and features of the kept samples."""
     mass: Float[Tensor, "R 1"]
     """Sum of their weights."""
     transmittance: Float[Tensor, "R 1"]
@@ -122,7 +122,7 @@ class RayOutputs:
     inverse_t: Float[Tensor, "R 1"]
     """At half the mass (``ops.composite.median_inverse_distance``); 0 for infinity, or without mass."""
     winner: Float[Tensor, "R 1"]
-    """The head that gives most of the mass."""
+    """The head with the largest share of the mass."""
     dropped_mass: Float[Tensor, "R 1"]
 
 
@@ -158,8 +158,8 @@ def render_fused_on_cpu(
     layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions
 ) -> RayOutputs:
     if "tiles" not in layout.packed:
-        # Rays pass over tiles from which nothing can be read: where the lower corner of four texels is in any other,
-        # one of them is stored.
+        # Rays skip tiles from which nothing stored can be read: where the lower corner of four texels lies in any other
+        # tile, one of the four is stored.
         columns, bricks, count = [torch.zeros(0, 2, dtype=torch.int32)], [torch.zeros(1, 4, dtype=torch.int32)], 0
         for grid in layout.grids[: len(layout.mpis)]:
             tiles = pad(grid.own_tiles, (0, 1, 0, 1))

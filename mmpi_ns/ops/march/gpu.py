@@ -1,8 +1,8 @@
-"""All heads of a ray at once, front to back, to the samples that matter: to train with, and summed for pictures.
+"""March of rays through all heads, front to back: kept samples for training, and their sums for images.
 
 The CPU's counterparts are ``march.cpp`` and ``render.cpp``. A program marches a few rays side by side (``gpu_walk.py``)
-and writes what they keep to slots, which are packed to train with, or read again and summed for pictures. A ray ends
-where its transmittance falls below 1e-5 and below the weight that a sample must have to be kept.
+and writes kept samples to slots, which are packed for training, or summed for images. A ray terminates where its
+transmittance falls below 1e-5 and below the weight that a sample must have to be kept.
 """
 
 # Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
@@ -27,13 +27,13 @@ from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
 OPAQUE = tl.constexpr(ends.OPAQUE)
 HALF = tl.constexpr(ends.HALF)
 STEPS = 8
-"""Samples that a ray looks up at once."""
+"""Samples of a ray per chunk of lookups."""
 RAYS = 4
-"""Rays of a program (one warp). Four times as many march no faster, and take minutes to compile."""
+"""Rays per program (one warp). Four times as many are no faster, and take minutes to compile."""
 RANGES = 256
-"""Rays of a program times their heads, of each of which it holds nine numbers: twice as many do not fit registers."""
+"""Rays per program times their heads, with nine numbers for each: twice as many do not fit the registers."""
 NUMBERS = 256
-"""Rays of a program of ``render_kernel`` times their channels: what its registers hold."""
+"""Rays per program of ``render_kernel`` times their channels, limited by its registers."""
 
 
 @triton.jit
@@ -41,7 +41,7 @@ def _store_samples(
     keep, ray, number_kept, room, head, plane, u, v, s, inverse_t, tau, skipped,
     heads, planes, ndc, inverse_ts, taus, skipped_before, STEPS: tl.constexpr,
 ):  # fmt: skip
-    """Writes samples to keep to the next slots of their rays; which of them there was room for."""
+    """Writes kept samples to the next slots of their rays. Returns which of them had room."""
     slot = number_kept[:, None] + before(keep.to(tl.int32), STEPS)
     keep = keep & (slot < room)
     to = ray[:, None].to(tl.int64) * room + slot
@@ -89,7 +89,7 @@ def march_kernel(
     HAS_CUBE: tl.constexpr, ALLOWS: tl.constexpr, CHOOSES: tl.constexpr, BLENDS: tl.constexpr, KEEP_ALL: tl.constexpr,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    """What ray r keeps is written from r * room on. ``numbers``: the most that a ray keeps, then that of each head."""
+    """Kept samples of ray r, written from r * room on. ``numbers``: largest number of a ray, then that of each head."""
     row, head_of = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, HEADS)
     exists = row < num_rays
     ray = tl.where(exists, row, 0)
@@ -157,7 +157,7 @@ def _read(table, grids, head, plane, place, has, channels, column, num_mpis, HAS
 
 @triton.jit
 def _weigh(taus, befores, slot, has, depth):
-    """Weights of samples behind so much optical depth, and the depth behind them."""
+    """Weights of samples behind a given optical depth, and the depth behind them."""
     tau = tl.load(taus + slot, has, 0.0)
     transmittance = tl.exp(-(depth + tl.load(befores + slot, has, 0.0)))
     return tl.where(has, transmittance * one_minus_exp(tau), 0.0), depth + tau
@@ -169,7 +169,7 @@ def render_kernel(
     gathered, masses, depths, medians, winners, num_rays, room, channels, num_mpis,
     HAS_CUBE: tl.constexpr, HEADS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sums over what rays kept; a lane a ray."""
+    """Sums over the kept samples of rays, one lane per ray."""
     ray, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
     inside, head_of = ray < num_rays, tl.arange(0, HEADS)[None, :]
     count, start = tl.load(kept + ray, inside, 0), ray.to(tl.int64) * room
@@ -201,10 +201,10 @@ def render_kernel(
 
 
 class Slots(NamedTuple):
-    """What rays kept, each in ``room`` slots of its own, before anything is waited for."""
+    """Kept samples of each ray in ``room`` slots, before any synchronisation."""
 
     kept: Int[Tensor, "R"]
-    """Number of them; what the other slots hold means nothing."""
+    """Number of kept samples; the other slots are undefined."""
     samples: list[Tensor]
     """See ``empty_samples``; [R, room] each."""
     skipped_total: Float[Tensor, "R 1"]
@@ -212,15 +212,15 @@ class Slots(NamedTuple):
     num_intersected: Int[Tensor, "R"]
     fully_covered: Bool[Tensor, "R 1"]
     numbers: Int[Tensor, "1+H"]
-    """The most that a ray kept, then what was kept of each head."""
+    """Largest number of kept samples of a ray, then that of each head."""
 
 
 def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
-    """``march`` up to where its result is packed, or summed."""
+    """``march`` up to the slots that are then packed or summed."""
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
     threshold, capacity = float(options.threshold), options.capacity
     room = options.most_kept(layout.most_samples) if capacity is None else capacity.slots
-    # Where all heads may answer, what stands for the choice is not read.
+    # If all heads may render, the placeholder of the choice is not read.
     parts = [rays.origins if x is None else x for x in dense_fields(rays)]
     m = Slots(
         kept=torch.empty(num_rays, dtype=torch.int32, device=device),
@@ -246,7 +246,7 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
 
 
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
-    """Waits for the device once, to size the result, unless its capacity is given."""
+    """``sampler.march`` on a GPU, which synchronises once, to size the result, unless a capacity is given."""
     m, capacity = march_into_slots(layout, tables, rays, options), options.capacity
     if capacity is None:
         widest, *of_heads = m.numbers.tolist()
@@ -263,7 +263,7 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
 def render_fused(
     layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions
 ) -> RayOutputs:
-    """Nothing is packed, and the host need not know how much any ray kept."""
+    """``sampler.render_fused`` on a GPU: sums over the slots, without packing or synchronisation."""
     m = march_into_slots(layout, tables, rays, options)
     num_rays, channels, device = len(rays.origins), features.shape[1], features.device
     gathered = torch.empty(num_rays, channels, device=device)

@@ -1,9 +1,8 @@
-"""A ray's walk through a scene on a GPU: where it crosses planes and the cube, which samples come next, what they hold,
-and their blending.
+"""Walk of a ray through a scene on a GPU: intersections with planes and cube, order of samples, lookups, blending.
 
-The counterpart of ``cpp/crossings.h``, ``cpp/walk.h`` and ``cpp/blend.h``; of crossings the references, which say why,
-are ``geometry.plane_hits``, ``geometry.cube_hits`` and ``march.crossings``. Which samples come next is arithmetic
-alone: every head's planes come near to far, and the nearest of the heads' next ones is taken. So a chunk of samples is
+The counterpart of ``cpp/crossings.h``, ``cpp/walk.h`` and ``cpp/blend.h``; the references of intersections, with their
+derivation, are ``geometry.plane_hits``, ``geometry.cube_hits`` and ``sampler.crossings``. The order of samples needs no
+lookup: every head's planes come near to far, and the nearest of the heads' next ones is taken. So a chunk of samples is
 chosen first and then looked up at once, and its loads do not wait for each other.
 """
 
@@ -49,7 +48,7 @@ from mmpi_ns.scene.geometry import FACING_EPS
 
 EPS = tl.constexpr(FACING_EPS)
 ENDLESS, REACHED = tl.constexpr(1e30), tl.constexpr(1e9)
-"""Distance to what a ray never reaches, and number of samples of the cube beyond which it reaches none."""
+"""Distance that stands for never, and number of samples in the cube beyond which a ray is taken to miss it."""
 NEGLIGIBLE = tl.constexpr(ends.NEGLIGIBLE)
 NEAREST_ZERO = tl.constexpr(ends.NEAREST_ZERO)
 ULPS = tl.constexpr(16 * 2.0**-23)
@@ -81,7 +80,7 @@ def local_ray(frame, x, y, z, dx, dy, dz):
 
 @triton.jit
 def _narrow(low, high, never, p, q, step, end):
-    """The range of m within p (m step + end) <= q too."""
+    """Range of m, narrowed to p (m step + end) <= q."""
     slope, rest = p * step, q - p * end
     bound = rest / tl.where(slope == 0, 1.0, slope)
     high = tl.where(slope > 0, tl.minimum(high, bound), high)
@@ -91,7 +90,7 @@ def _narrow(low, high, never, p, q, step, end):
 
 @triton.jit
 def _is_intersected(m, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last):
-    """Whether plane m meets all conditions: they decide where the division may be off by one."""
+    """Whether a ray intersects plane m, by all conditions, because the division may be off by one."""
     w = m * step + end
     intersected = (w * oz < 1) & (m >= 0) & (m <= last) & (near * w <= 1) & (far * w <= q_far)
     intersected = intersected & (bend_u * w <= right) & (-bend_u * w <= left)
@@ -108,7 +107,7 @@ def _settle(m, out, near, far, q_far, bend_u, left, right, bend_v, up, down, oz,
 
 @triton.jit
 def _intersected_range(frame, u, bend_u, v, bend_v, oz, dz, near, far):
-    """Of each ray in each MPI the number m of the nearest intersected plane, and how many are intersected."""
+    """Number m of the nearest intersected plane of each ray in each MPI, and the number of intersected planes."""
     # Half-spaces p w <= q of the disparity w: from near to far, and within the extent.
     far, extent = 1 / far, frame + EXTENT
     p_near, p_far = dz * near + oz, -(dz + oz * far)
@@ -141,7 +140,7 @@ def _within(enter, leave, o, d, lower, upper):
 
 @triton.jit
 def _cube_range(cube, x, y, z, dx, dy, dz, near, far):
-    """Of each ray the number of its first sample in the cube, and how many it has there."""
+    """Number of each ray's first sample in the cube, and the number of its samples there."""
     enter, leave = _within(near, far, x, dx, tl.load(cube), tl.load(cube + 9))
     enter, leave = _within(enter, leave, y, dy, tl.load(cube + 1), tl.load(cube + 10))
     enter, leave = _within(enter, leave, z, dz, tl.load(cube + 2), tl.load(cube + 11))
@@ -156,9 +155,9 @@ def _cube_range(cube, x, y, z, dx, dy, dz, near, far):
 def cross(ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, scene, cube, content_near,
           K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, ALLOWS: tl.constexpr,
           CHOOSES: tl.constexpr):  # fmt: skip
-    """The samples of rays in the heads that may answer them (``march.crossings``): of each head the number of its first
-    one and how many there are, the tangents on its planes, and the ray's origin and direction along its axis; and
-    whether the heads must explain the ray."""
+    """Samples of rays in the allowed heads (``sampler.crossings``): for each head the number of its first sample and of
+    all, the tangents on its planes, and the ray's origin and direction along its axis; and whether the ray is fully
+    covered."""
     head, at = tl.arange(0, HEADS)[None, :], ray[:, None]
     is_mpi, near, far = head < K, tl.load(nears + at), tl.load(fars + at)
     frame = scene + tl.where(is_mpi, head, 0) * FLOATS
@@ -198,7 +197,7 @@ def cross(ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, sc
 
 @triton.jit
 def _on_plane(row, u, bend_u, v, bend_v, number):
-    """Disparity, u and v of planes of MPIs where rays cross them."""
+    """Disparity, u and v of planes of MPIs where rays intersect them."""
     w = number.to(tl.float32) * tl.load(row + STEP) + tl.load(row + END)
     u, v = u + w * bend_u - tl.load(row + U0), v + w * bend_v - tl.load(row + V0)
     return w, u * tl.load(row + U_SCALE) - 1, v * tl.load(row + V_SCALE) - 1
@@ -206,14 +205,14 @@ def _on_plane(row, u, bend_u, v, bend_v, number):
 
 @triton.jit
 def pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K: tl.constexpr, HEADS: tl.constexpr):
-    """How many of each head's samples hold nothing before the first that does: planes of MPIs in empty tiles."""
+    """Number of each head's samples before the first occupied one: planes of MPIs in empty tiles."""
     head, done = tl.arange(0, HEADS)[None, :], count * 0
     passes, mpi = (head < K) & (count > 0), tl.where(head < K, head, 0) + done
     while tl.max(tl.max(passes.to(tl.int32), 1), 0) > 0:
         number = first - done
         _, x, y = _on_plane(constants + mpi * FLOATS, u, bend_u, v, bend_v, number)
         plane = tl.load(grids + mpi * INTS + DEPTH, passes, 0).to(tl.int32) - 1 - number
-        # Whether the tables hold any of the four texels around.
+        # Whether any of the four surrounding texels is stored.
         column, _ = cell(x, tl.load(grids + mpi * INTS + WIDTH))
         row, _ = cell(y, tl.load(grids + mpi * INTS + HEIGHT))
         held = row_of(grids, mpi, plane, row, column, passes) >= STORED
@@ -227,15 +226,15 @@ def pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K: tl.const
 
 @triton.jit
 def _put(values, of_heads, is_best, here):
-    """Puts the best head's value into a column."""
+    """A column filled with the best head's value."""
     return tl.where(here, tl.sum(tl.where(is_best, of_heads, 0), 1)[:, None], values)
 
 
 @triton.jit
 def _choose(first, count, done, u, bend_u, v, bend_v, oz, dz, constants, cube, K: tl.constexpr, HEADS: tl.constexpr,
             HAS_CUBE: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr):  # fmt: skip
-    """The next samples of each ray in the order of distance: head, number, 1/t (-1: none), tangents on the head's
-    planes. Equal ones by head."""
+    """Next samples of each ray in order of distance, equal ones by head: head, number, 1/t (-1: none), tangents on the
+    head's planes."""
     column, head, every = tl.arange(0, STEPS)[None, :], tl.arange(0, HEADS)[None, :], tl.arange(0, HEADS)
     is_mpi = (every < K)[None, :]
     step = tl.load(constants + every * FLOATS + STEP, every < K, 0.0)[None, :]
@@ -256,7 +255,7 @@ def _choose(first, count, done, u, bend_u, v, bend_v, oz, dz, constants, cube, K
         heads = tl.where(here, best[:, None].to(tl.int32), heads)
         inverse_ts = tl.where(here, top[:, None], inverse_ts)
         numbers = _put(numbers, next_ones, is_best, here)
-        # Computed anew from the head's axes, these would take more registers.
+        # Recomputed from the head's axes, these would take more registers.
         us, bends_u = _put(us, u, is_best, here), _put(bends_u, bend_u, is_best, here)
         vs, bends_v = _put(vs, v, is_best, here), _put(bends_v, bend_v, is_best, here)
         done += is_best.to(tl.int32)
@@ -287,7 +286,7 @@ def in_mpi(constants, k, x, y, z, dx, dy, dz, inverse_t):
 
 @triton.jit
 def in_cube(cube, x, y, z, dx, dy, dz, inverse_t):
-    """Likewise in the cube."""
+    """Position of a sample in the cube, and whether it lies inside."""
     t = 1 / tl.maximum(inverse_t, NEAREST_ZERO)
     u, v, s = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
     inside = (inverse_t > 0) & (tl.abs(u) <= 1) & (tl.abs(v) <= 1) & (tl.abs(s) <= 1)
@@ -296,7 +295,7 @@ def in_cube(cube, x, y, z, dx, dy, dz, inverse_t):
 
 @triton.jit
 def _count_vote(vote_of_head, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick):
-    """Adds head k's vote on samples: (mpi vote, highest of the others, sum of e^(other - highest))."""
+    """Votes on samples with that of head k: (of their own head, highest of the others, sum of e^(other - highest))."""
     is_own = head == k
     looked_up = thick & (inside | is_own)
     vote = trilinear(reliability, grids, k, u, v, s, looked_up)
@@ -346,7 +345,7 @@ def next_samples(
     K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, BLENDS: tl.constexpr, RAYS: tl.constexpr,
     STEPS: tl.constexpr,
 ):  # fmt: skip
-    """The next samples of rays that go on: whether there is one, its head, plane, NDC, 1/t and optical depth."""
+    """Next samples of active rays: whether there is one, its head, plane, NDC, 1/t and optical depth."""
     head, number, inverse_t, u, bend_u, v, bend_v, done = _choose(
         first, count, done, u, bend_u, v, bend_v, local_z, local_dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
     )
@@ -377,7 +376,7 @@ def next_samples(
 
 @triton.jit
 def before(values, STEPS: tl.constexpr):
-    """Sum of the earlier columns. Summed, not subtracted: x - x loses what came before a large x."""
+    """Sum of the earlier columns. Summed, not subtracted: x - x loses small terms before a large x."""
     i = tl.arange(0, STEPS)
     earlier = (i[:, None] > i[None, :])[None, :, :]
     return tl.sum(tl.where(earlier, values[:, None, :], 0), 2)

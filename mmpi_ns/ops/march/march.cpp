@@ -1,5 +1,5 @@
-// Samples of rays to train: one ray at a time, every head's samples near to far in blocks, so the merge takes the nearest
-// head at each step, and a ray ends where nothing behind it can matter. Why not abreast: walk.h.
+// Samples of training rays: one ray at a time, every head's samples near to far in blocks. The merge takes the nearest
+// head at each step, and a ray terminates where the rest is negligible. Why not abreast: walk.h.
 #include "parts.h"
 #include "walk.h"
 
@@ -13,7 +13,7 @@ inline void cells(Lanes coordinate, int64_t size, IntLanes& lower, Lanes& fracti
     fraction = position - real(lower);
 }
 
-// Where sixteen samples lie on planes of an MPI, and the texels at their lower corners.
+// Positions of sixteen samples on planes of an MPI, and the texels at their lower corners.
 struct PlaneCells {
     int32_t column[WIDTH], line[WIDTH], tile[WIDTH], texel[WIDTH], edge[WIDTH]; // edge: corners lie in several bricks
     float fx[WIDTH], fy[WIDTH];
@@ -44,7 +44,7 @@ struct Run {
     float next() const { return inverse_t[at]; }
 };
 
-// Raw densities to optical depths. Lanes beyond the block's size hold rubbish that nobody reads.
+// Raw densities to optical depths. Lanes beyond the block's size are undefined and unused.
 void finish(Run& run, float interval) {
     for (int j = run.size; j < WIDTH; j++) run.tau[j] = 0;
     const Lanes tau = softplus_lanes(load(run.tau)) * interval;
@@ -52,7 +52,7 @@ void finish(Run& run, float interval) {
     store(run.pass, exp_lanes(-tau));
 }
 
-// The next samples of an MPI. Where nothing is stored there is nothing to see: with `skips` such samples are left out.
+// The next samples of an MPI. With `skips`, samples without a stored texel, which are transparent, are skipped.
 void fill_mpi(Run& run, const Scene& scene, const Crossing& at, int ray, int64_t k, bool skips) {
     const Mpi& mpi = scene.mpis[k];
     const Grid& grid = scene.grids[k];
@@ -78,9 +78,9 @@ void fill_mpi(Run& run, const Scene& scene, const Crossing& at, int ray, int64_t
                 const float* texel = table + int64_t(brick) * BRICK + cells.texel[j];
                 corners[0] = texel[0], corners[1] = texel[1], corners[2] = texel[8], corners[3] = texel[9];
             } else {
-                const Corners found(grid, first + j, cells.line[j], cells.column[j]);
-                if (skips && !found.stored) continue;
-                for (int a = 0; a < 4; a++) corners[a] = table[found.row[a]];
+                const Corners around(grid, first + j, cells.line[j], cells.column[j]);
+                if (skips && !around.stored) continue;
+                for (int a = 0; a < 4; a++) corners[a] = table[around.row[a]];
             }
             const float fx = cells.fx[j], fy = cells.fy[j], gx = 1 - fx, gy = 1 - fy;
             run.tau[size] = gx * gy * corners[0] + fx * gy * corners[1] + gx * fy * corners[2] + fx * fy * corners[3] +
@@ -125,7 +125,7 @@ struct Packed : Samples<int64_t> {
     bool* valid;
 };
 
-// What a ray keeps goes behind what the rays before it kept.
+// Kept samples, one ray behind the other.
 struct Slots : Samples<int32_t> {
     int64_t size;
 
@@ -210,10 +210,10 @@ class Training {
     }
 };
 
-// Marches rays [begin, end), each of which keeps `room` samples at most. What they keep is written one ray behind the
-// other, from begin * room on; where a ray's samples begin, to starts[ray]; how many, to kept[ray].
+// Marches rays [begin, end), each of which keeps `room` samples at most. Kept samples are written one ray behind the
+// other, from begin * room on; their first index to starts[ray], their number to kept[ray].
 void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, int64_t room, float threshold,
-                float fair_share, bool blends, int64_t* starts, int64_t* kept, int64_t* intersected, bool* fully_covered,
+                float fair_share, bool blends, int64_t* starts, int64_t* kept, int64_t* intersected, bool* covered,
                 float* skipped_total, float* dropped_mass, const Samples<int32_t>* samples) {
     Training training(*scene, threshold, fair_share, blends);
     Crossings crossings;
@@ -225,12 +225,12 @@ void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays
             starts[ray] = slots.size;
             training.march(packet, crossings, int(ray - first), slots, skipped_total[ray], dropped_mass[ray]);
             kept[ray] = slots.size - starts[ray];
-            intersected[ray] = crossings.total[ray - first], fully_covered[ray] = crossings.fully_covered[ray - first];
+            intersected[ray] = crossings.total[ray - first], covered[ray] = crossings.fully_covered[ray - first];
         }
     }
 }
 
-// Copies what rays [begin, end) kept into `width` slots each; the rest of the slots is 0.
+// Copies the kept samples of rays [begin, end) into `width` slots each; the rest of the slots is 0.
 void mmpi_pack(int64_t begin, int64_t end, const int64_t* starts, const int64_t* kept, int64_t width,
                const Samples<int32_t>* from, const Packed* to) {
     // Array by array, so that copies and zeros (most slots, where one ray keeps many) go a cache line at a time.

@@ -7,7 +7,7 @@ namespace {
 
 constexpr int CORNERS = 4;
 
-// The tiles of the MPIs from which something can be read, in the order of their columns.
+// The tiles of the MPIs from which stored texels can be read, in the order of their columns.
 struct Tiles {
     const Column* columns;
     const int32_t (*bricks)[CORNERS]; // of the tile itself, right of it, below it, and right below
@@ -84,7 +84,7 @@ struct Floats {
 
     void weighed(const Reads&, Lanes) const {}
 
-    // What one of the samples reads, which is asked for at once.
+    // The rows that one of the samples reads, prefetched.
     void look_up(const Reads& reads, int lane, Sample& sample) const {
         sample.taps = reads.taps;
         for (int tap = 0; tap < reads.taps; tap++)

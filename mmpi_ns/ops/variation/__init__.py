@@ -28,10 +28,10 @@ def total_variation(
     Args:
         values: the texels, gathered from the table; with gradients.
         table: the pooled table (held fixed).
-        rows: where they came from, those of a brick together; none of a brick's that lie beyond the border of a plane.
+        rows: of these texels in the table, those of a brick together; none beyond the border of a plane.
         layout: of the scene.
         scales: weight of a difference along x, y and z, of each head.
-        chroma: how many times more than they already do differences of chroma count in the gradient.
+        chroma: additional factor on the gradient of chroma.
     """
     total = values.new_zeros(())
     if chroma > 0 and values.requires_grad:
@@ -46,7 +46,7 @@ def total_variation(
 
 
 def weigh_chroma(gradient: Float[Tensor, "N C"], times: float) -> Float[Tensor, "N C"]:
-    """Gradients of texels whose part along chroma, three colours less their mean, counts ``times`` times more."""
+    """Gradients of texels, with the part along chroma (three colours less their mean) weighted ``times`` times more."""
     colors = gradient[:, :COLORS]
     return torch.cat([colors + times * (colors - colors.mean(-1, keepdim=True)), gradient[:, COLORS:]], -1)
 
@@ -57,7 +57,7 @@ def clamped_differences(
     """Sum of clamped neighbour differences, whose gradient is DVGO's (L_TV).
 
     DVGO adds ``scale / 6 * clamp(v - v_neighbour, -1, 1)`` to the gradient of each touched texel. That is the gradient
-    of a Huber function of the difference with the neighbour held fixed, so it is an ordinary loss here.
+    of a Huber function of the difference with the neighbour held fixed, here an ordinary loss.
 
     Args:
         values: texels that the batch touched, one row each.
@@ -71,7 +71,7 @@ def clamped_differences(
 
 
 class WithGradient(torch.autograd.Function):
-    """A loss whose gradient was computed with it, for one backward pass."""
+    """A loss with a precomputed gradient, for one backward pass."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, loss: Tensor, gradient: Tensor) -> Tensor:
@@ -80,12 +80,12 @@ class WithGradient(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
-        gradient, ctx.gradient = ctx.gradient, None  # scaled in place: it is as large as what the batch read
+        gradient, ctx.gradient = ctx.gradient, None  # scaled in place, as it is as large as the batch's texels
         return gradient.mul_(grad_outputs[0]), None, None
 
 
 PART = 4096
-"""Texels whose differences are summed together, so that a sum does not depend on the threads."""
+"""Texels per partial sum, so that sums do not depend on the threads."""
 
 
 @total_variation.on_cpu

@@ -14,7 +14,7 @@ from mmpi_ns.ops.layout import SceneLayout, dense
 from mmpi_ns.ops.variation import WithGradient, weigh_chroma
 
 ROWS = 128
-"""Texels of a program."""
+"""Texels per program."""
 
 
 @triton.jit(do_not_specialize=("count", "rows", "values"))

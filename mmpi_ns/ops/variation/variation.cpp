@@ -8,9 +8,9 @@ namespace {
 
 constexpr int64_t PART = 4096; // rows whose differences are summed together (PART of __init__.py)
 
-// What lies around a brick.
+// Neighbours of a brick.
 struct Surroundings {
-    int64_t head = -1;      // -1: nobody's
+    int64_t head = -1;      // -1: none
     int64_t beside[6] = {}; // first rows of the bricks left, right, above, below, before, behind; 0: nothing is stored
     int64_t columns = 8, lines = 8; // of the brick that lie on the plane
 };
@@ -55,7 +55,7 @@ void add_row(Group& group, const Surroundings& at, int64_t row) {
     to[6] = other(beside[5], 0);
 }
 
-// Adds scale * Huber(center - other) and its slope. Numbers that are none stay so.
+// Adds scale * Huber(center - other) and its slope. NaN stays NaN.
 void add_difference(Lanes center, Lanes other, float scale, Lanes& slope, Lanes& value) {
     const Lanes difference = center - other, below = difference > 1.0f ? splat(1) : difference;
     const Lanes clamped = below < -1.0f ? splat(-1) : below;
@@ -63,7 +63,7 @@ void add_difference(Lanes center, Lanes other, float scale, Lanes& slope, Lanes&
     value += scale * clamped * (difference - 0.5f * clamped);
 }
 
-// Slopes whose part along chroma, three colours less their mean, counts `times` times more (weigh_chroma).
+// Slopes with the part along chroma (three colours less their mean) weighted `times` times more (weigh_chroma).
 Lanes weigh_chroma(Lanes slope, float times) {
     const float mean = (slope[0] + slope[1] + slope[2]) / COLORS;
     return IOTA < float(COLORS) ? slope + times * (slope - mean) : slope;
@@ -80,7 +80,7 @@ Lanes vary(const Table& table, const Group& group, const float* scale, float chr
             for (int k = 0; k < 6; k++)
                 add_difference(center, table.read(group.rows[i][k + 1] * channels + first), scale[k / 2], slope, value);
             if (chroma > 0 && first == 0) slope = weigh_chroma(slope, chroma);
-            store(grad + i * channels + first, slope); // what lies beyond the row is overwritten by the next one
+            store(grad + i * channels + first, slope); // the next row overwrites what lies beyond this one
             total += IOTA < float(channels - first) ? value : Lanes{};
         }
     return total;
@@ -101,7 +101,7 @@ void mmpi_total_variation(int64_t begin, int64_t end, const int64_t* rows, int64
         const int64_t stop = std::min(count, (part + 1) * PART);
         int64_t next = part * PART, first[2];
         Group groups[2];
-        // The next rows of one head, and their memory asked for.
+        // The next rows of one head, with their memory prefetched.
         const auto find = [&](int which) {
             Group& group = groups[which];
             first[which] = next;

@@ -12,12 +12,12 @@ constexpr int REACH = 3, SIDE = 2 * REACH + 1, PIXELS = SIDE * SIDE, BITS = 5, S
 
 // An image, or what another one shows of its pixels, in rows of whole lanes; and sums over windows about the pixels of
 // a row: of the gray levels, of their squares, and of their products with the image's.
-struct Shown {
+struct Window {
     const int64_t height, width, stride = (width + WIDTH - 1) / WIDTH * WIDTH, length = stride + WIDTH;
     std::vector<int32_t> gray = std::vector<int32_t>(height * stride), marks = gray;
     std::vector<int32_t> columns = std::vector<int32_t>(3 * length);
 
-    void add(const Shown& image, int64_t row, int32_t sign) {
+    void add(const Window& image, int64_t row, int32_t sign) {
         const int64_t from = std::clamp<int64_t>(row, 0, height - 1) * stride;
         const int32_t *x = gray.data() + from, *y = image.gray.data() + from;
         int32_t *sum = columns.data() + REACH, *squares = sum + length, *products = squares + length;
@@ -29,7 +29,7 @@ struct Shown {
     }
 
     // To a row from the one before, or to the first.
-    void slide(const Shown& image, int64_t row) {
+    void slide(const Window& image, int64_t row) {
         if (row == 0) std::fill(columns.begin(), columns.end(), 0);
         for (int64_t i = -REACH; row == 0 && i < REACH; i++) add(image, i, 1);
         if (row > 0) add(image, row - REACH - 1, -1);
@@ -86,16 +86,16 @@ void mmpi_most_alike(int64_t, int64_t, const uint8_t* gray, const int32_t* corne
                      const float* linear, const float* b, const float* inverse, const float* smallest, float largest,
                      bool pairs, int64_t height, int64_t width, int64_t, int64_t count, int64_t, int64_t depths,
                      float* alike, float* at) {
-    Shown image{height, width};
+    Window image{height, width};
     for (int64_t i = 0; i < height * width; i++) image.gray[i / width * image.stride + i % width] = gray[i];
-    std::vector<Shown> others(count, image);
+    std::vector<Window> others(count, image);
     for (int64_t i = 0; i < 3 * height * width; i++) alike[i] = -1, at[i] = 0;
     for (const float* q = inverse; q < inverse + depths; q++) {
         for (int64_t k = 0; k < count; k++)
             others[k].look(corners, levels + 6 * k, linear + 9 * k, b + 3 * k, *q, !pairs);
         for (int64_t row = 0; row < height; row++) {
             image.slide(image, row);
-            for (Shown& other : others) other.slide(image, row);
+            for (Window& other : others) other.slide(image, row);
             for (int64_t column = 0; column < width; column += WIDTH) {
                 const int64_t here = row * image.stride + column, pixel = row * width + column, some = width - column;
                 const IntLanes sum = image.sum(0, column);
@@ -106,10 +106,10 @@ void mmpi_most_alike(int64_t, int64_t, const uint8_t* gray, const int32_t* corne
                     const Mask kinds[3] = {possible & ~marked, ~possible & ~marked, marked};
                     for (int n = 0; n < 3; n++) best[n] = pick(kinds[n], most(one, best[n]), best[n]);
                 };
-                for (const Shown& other : others) {
+                for (const Window& other : others) {
                     const IntLanes products = PIXELS * other.sum(2, column) - sum * other.sum(0, column);
-                    const Mask is_shown = load_some<IntLanes>(other.gray.data() + here, WIDTH) > 0;
-                    const Lanes one = pick(is_shown, real(products) * over * other.over_contrast(column), splat(-1));
+                    const Mask is_visible = load_some<IntLanes>(other.gray.data() + here, WIDTH) > 0;
+                    const Lanes one = pick(is_visible, real(products) * over * other.over_contrast(column), splat(-1));
                     second = most(second, least(first, one));
                     first = most(first, one);
                     if (!pairs) take(one, load_some<IntLanes>(other.marks.data() + here, WIDTH) > 0);

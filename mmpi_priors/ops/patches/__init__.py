@@ -134,17 +134,17 @@ class _References:
 
 def _better(references: _References, patches: Patches, planes: Tensor, others: Others) -> Patches:
     best, second = (torch.full(planes.shape[:2], -1.0, dtype=planes.dtype) for _ in range(2))
-    is_shown, is_hidden = torch.zeros((2, *planes.shape[:2]), dtype=torch.bool)
+    is_visible, is_hidden = torch.zeros((2, *planes.shape[:2]), dtype=torch.bool)
     for sizes, linear, b in zip(others.levels, others.linear, others.b, strict=True):
-        alike, shown = _correlations(references, planes, others.corners, sizes, linear, b)
+        alike, visible = _correlations(references, planes, others.corners, sizes, linear, b)
         second = torch.maximum(second, torch.minimum(best, alike))
-        best, is_shown, is_hidden = torch.maximum(best, alike), is_shown | shown, is_hidden | ~shown
+        best, is_visible, is_hidden = torch.maximum(best, alike), is_visible | visible, is_hidden | ~visible
     if len(others.b) == 1:
         second = best
     else:
         second = torch.where(is_hidden, torch.maximum(second, best - ALONE), second)
     flat = references.squares < LEAST_CONTRAST**2 * references.values.shape[-1]
-    mean = torch.where(is_shown & ~flat & (planes[..., 0] > 0), (best + second) / 2, -1.0)
+    mean = torch.where(is_visible & ~flat & (planes[..., 0] > 0), (best + second) / 2, -1.0)
     better = mean > patches.alike
     return Patches(torch.where(better[..., None], planes, patches.planes), torch.where(better, mean, patches.alike))
 
@@ -161,7 +161,7 @@ def _correlations(
     ahead = middle[2] > LEAST_AHEAD
     at = middle[:2] / torch.where(ahead, middle[2], 1.0)
     height, width = sizes[1, 1:].tolist()
-    shown = ahead & (at[0] >= 0.5) & (at[0] <= width - 0.5) & (at[1] >= 0.5) & (at[1] <= height - 0.5)
+    visible = ahead & (at[0] >= 0.5) & (at[0] <= width - 0.5) & (at[1] >= 0.5) & (at[1] <= height - 0.5)
     # Pixels there for a pixel here decide the size at which the image is looked at.
     (xr, yr), (xd, yd) = ((to[:2] - at * to[2]) / torch.where(ahead, middle[2], 1.0) for to in (to_right, to_down))
     area = (xr * yd - xd * yr).abs()
@@ -185,7 +185,7 @@ def _correlations(
     values = values - values.mean(-1, keepdim=True)
     squares = values.square().sum(-1)
     alike = (values * references.values).sum(-1) / (squares * references.squares).clamp(min=1e-20).sqrt()
-    return torch.where(shown & whole & (squares >= LEAST_CONTRAST**2 * values.shape[-1]), alike, -1.0), shown
+    return torch.where(visible & whole & (squares >= LEAST_CONTRAST**2 * values.shape[-1]), alike, -1.0), visible
 
 
 def others_of(

@@ -30,7 +30,7 @@ struct Other {
 
     // Correlations with sixteen patches whose values less their means are given; -1 where it does not show them.
     Lanes alike(const Lanes* values, Lanes squares, Lanes x, float y, const Plane& plane, float stride,
-                Mask& shown) const {
+                Mask& visible) const {
         Lanes middle[3], right[3], down[3];
         for (int i = 0; i < 3; i++) {
             const float* m = linear + 3 * i;
@@ -41,8 +41,8 @@ struct Other {
         const Mask ahead = middle[2] > LEAST_AHEAD;
         const Lanes over = 1.0f / pick(ahead, middle[2], splat(1)), column = middle[0] * over, row = middle[1] * over;
         const float height = sizes[4], width = sizes[5];
-        shown = ahead & (column >= 0.5f) & (column <= width - 0.5f) & (row >= 0.5f) & (row <= height - 0.5f);
-        if (!any(shown)) return splat(-1);
+        visible = ahead & (column >= 0.5f) & (column <= width - 0.5f) & (row >= 0.5f) & (row <= height - 0.5f);
+        if (!any(visible)) return splat(-1);
         // Pixels there for a pixel here decide the size at which the image is looked at.
         const Lanes xr = right[0] - column * right[2], yr = right[1] - row * right[2];
         const Lanes xd = down[0] - column * down[2], yd = down[1] - row * down[2];
@@ -70,7 +70,7 @@ struct Other {
                 const Lanes depth = depths + beside * right[2];
                 nearest = least(nearest, depth);
                 const Lanes over = reciprocal(most(depth, splat(1e-12f)));
-                // What is no number, where nothing is shown, becomes 0.
+                // What is no number, where nothing is visible, becomes 0.
                 const Lanes u = least(most((row_x + beside * to_x) * over, Lanes{}), last_column);
                 const Lanes v = least(most((row_y + beside * to_y) * over, Lanes{}), last_row);
                 const IntLanes left = truncated(u), top = truncated(v);
@@ -87,7 +87,7 @@ struct Other {
         }
         const Lanes correlation = product / root(most(their_squares * squares, splat(1e-20f)));
         const Lanes textured = pick(their_squares >= LEAST_SQUARES, correlation, splat(-1));
-        return pick(shown, pick(nearest >= LEAST_SHARE * middle[2], textured, splat(-1)), splat(-1));
+        return pick(visible, pick(nearest >= LEAST_SHARE * middle[2], textured, splat(-1)), splat(-1));
     }
 };
 
@@ -146,19 +146,19 @@ struct Pixels {
         counts &= (plane.q > 0) & (squares >= LEAST_SQUARES);
         if (!any(counts)) return;
         Lanes first = splat(-1), second = splat(-1);
-        Mask is_shown{}, is_hidden{};
+        Mask is_visible{}, is_hidden{};
         for (int64_t k = 0; k < of.count; k++) {
             const Other other{of.corners, of.sizes + 3 * LEVELS * k, of.linear + 9 * k, of.b + 3 * k};
-            Mask shown;
-            const Lanes one = other.alike(values, squares, x, y, plane, of.stride, shown);
-            is_shown |= shown;
-            is_hidden |= ~shown;
+            Mask visible;
+            const Lanes one = other.alike(values, squares, x, y, plane, of.stride, visible);
+            is_visible |= visible;
+            is_hidden |= ~visible;
             second = most(second, least(first, one));
             first = most(first, one);
         }
         second = of.count == 1 ? first : pick(is_hidden, most(second, first - ALONE), second);
         const Lanes mean = (first + second) * 0.5f;
-        const Mask better = counts & is_shown & (mean > alike);
+        const Mask better = counts & is_visible & (mean > alike);
         alike = pick(better, mean, alike);
         best = {pick(better, plane.q, best.q), pick(better, plane.right, best.right),
                 pick(better, plane.down, best.down)};

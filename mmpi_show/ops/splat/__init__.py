@@ -57,7 +57,7 @@ def splat_errors(
     gaussians: Gaussians,
     view: View,
     colors: Float[Tensor, "N 3"],
-    shown: Float[Tensor, "H W 3"],
+    rendered: Float[Tensor, "H W 3"],
     errors: Float[Tensor, "H W 3"],
 ) -> Float[Tensor, "N 6"]:
     """Changes of colours and opacities that reduce an image's errors.
@@ -75,7 +75,7 @@ def splat_errors(
         J error / (sum of |J| of all Gaussians) and of |J|.
     """
     sums = torch.zeros(len(gaussians.means), 6)
-    _run(splat_errors, gaussians, view, colors=colors, shown=shown, errors=errors, out=sums)
+    _run(splat_errors, gaussians, view, colors=colors, rendered=rendered, errors=errors, out=sums)
     return sums
 
 

@@ -110,9 +110,9 @@ void mmpi_splat_image(const View* view, const Gaussians* all, const float* color
 }
 
 // Sums [count, 6] over the pixels of an image: of each Gaussian's weight times (error, 1), and, with J what a number of
-// the image changes with the logit of its opacity, of (J error / (sum of all Gaussians' |J|), |J|). `shown` is the image
-// with its background, [height, width, 3].
-void mmpi_splat_errors(const View* view, const Gaussians* all, const float* colors, const float* shown,
+// the image changes with the logit of its opacity, of (J error / (sum of all Gaussians' |J|), |J|). `rendered` is the
+// image with its background, [height, width, 3].
+void mmpi_splat_errors(const View* view, const Gaussians* all, const float* colors, const float* rendered,
                        const float* errors, float* sums) {
     const std::vector<Seen> seen = sorted(*view, *all);
     std::vector<float> front, total(int64_t(view->width) * view->height * 3, 0.0f);
@@ -122,7 +122,7 @@ void mmpi_splat_errors(const View* view, const Gaussians* all, const float* colo
             for (int c = 0; c < 3; c++) {
                 const int64_t at = 3 * pixel + c;
                 front[at] += before * alpha * colors[3 * i + c];
-                const float behind = (shown[at] - front[at]) / (1 - alpha);
+                const float behind = (rendered[at] - front[at]) / (1 - alpha);
                 const float change = alpha < STRONGEST ? alpha * (1 - all->alphas[i]) : 0.0f;
                 use(6 * i + c, at, before * alpha, change * (before * colors[3 * i + c] - behind));
             }
