@@ -19,20 +19,19 @@ from mmpi_ns.utils.machine import processor
 SHOWN = {
     "street": (
         Demo(kind="street", images=64),
-        "A drive of 40 m past houses and parked cars: the kind of capture that MPIs are made for.",
+        "A drive of 40 m past houses and parked cars.",
     ),
     "long-road": (
         Demo(kind="long-road", images=100, length=150.0, steps=400),
-        "A winding road. It is split into windows, each with its own MPIs, trained one after the other.",
+        "Split into windows, each with its own MPIs.",
     ),
     "room": (
         Demo(kind="room", images=64, steps=600),
-        "A walk around a table, looking in all directions. MPIs face wherever the cameras looked.",
+        "A walk around a table, looking in all directions.",
     ),
     "object": (
         Demo(kind="object", images=48, steps=600),
-        "An object filmed from all sides, for which MPIs are not made: seen from behind, an MPI shows the edges of its "
-        "planes.",
+        "Filmed from all sides, for which MPIs are not made: from behind, the edges of planes are visible.",
     ),
 }
 """Each scene with the options of making and training it, and a sentence about it."""
