@@ -55,10 +55,11 @@ class Verdict:
 
 def remedy(cameras: int, is_sequence: bool, is_given: bool) -> str:
     """Remedies for a capture of so many cameras, with or without given intrinsics."""
-    ways = ["give --focal (and --lens) if you know them"] if cameras == 1 and not is_given else []
+    ways = [] if is_sequence else ["add images that overlap more"]
+    ways += ["give --focal (and --lens) if you know them"] if cameras == 1 and not is_given else []
     ways += ["try --lens radial, as each lens is known from few images"] if cameras > 1 and not is_given else []
     ways += ["mask what moves (--masks)"]
-    ways += ["prepare the frames before and after apart" if is_sequence else "add images that overlap more"]
+    ways += ["prepare the frames before and after apart"] if is_sequence else []
     text = "; or ".join(ways)
     return f"{text[0].upper()}{text[1:]}."
 

@@ -169,8 +169,8 @@ def too_few_depths(shots: Sequence[Shot]) -> str:
         return ""
     return (
         f"Nothing is masked, as other images confirm the depths of {share:.0%} of the textured pixels alone: too few "
-        "to tell motion from occlusion. People who walk along may be left in: take images closer together, or mask "
-        "them by hand (mask_path)."
+        "to tell motion from occlusion. People who walk along may be left in: take images closer together "
+        "(of a video: mmpi-prepare --max-frames), or mask them by hand (mask_path)."
     )
 
 

@@ -225,7 +225,7 @@ def test_the_chosen_track_is_compared_as_it_was_before_it_alone_was_adjusted(sou
     assert judge_together(adjusted, [sound], True, before=replace(sound, name="global")).grade == "right"
     assert "--focal" in remedy(1, True, False) and "frames before" in remedy(1, True, False)
     assert "--focal" not in remedy(10, False, False) and "frames" not in remedy(10, False, False)
-    assert remedy(1, False, True).startswith("Mask what moves")
+    assert remedy(1, False, True).startswith("Add images that overlap more")
 
 
 def test_a_track_from_another_focal_length_that_is_as_good_speaks_against_the_chosen_one(sound):
