@@ -9,6 +9,8 @@ import pytest
 from tiny_scene import wall_points, write_scene
 from training_runs import datamanager
 
+from mmpi_ns.data.checks import log_once
+
 
 def scene_with_points(folder, points, sfm=False):
     """The tiny scene, without a COLMAP model unless asked for, with these points in ``ply_file_path``."""
@@ -67,6 +69,7 @@ def test_a_cloud_gives_depths_where_images_are_not_matched(tmp_path):
 
 def test_a_cloud_beside_tracks_is_said_to_be_unused_and_no_more(tmp_path, capsys):
     """Also where single points are absurd, as in the cloud of a COLMAP model."""
+    log_once.cache_clear()
     data = scene_with_points(tmp_path / "scene", np.vstack([wall_points(), [[1e30, 0, 0]]]), sfm=True)
     assert datamanager(data).observations.loose is None
     said = " ".join(capsys.readouterr().out.split())
