@@ -390,9 +390,7 @@ def only_one(work: Path) -> Iterator[None]:
     except (OSError, RuntimeError, ValueError) as error:
         free = shutil.disk_usage(next(p for p in work.parents if p.is_dir())).free
         if getattr(error, "errno", None) in FULL or free < LEFT:
-            summary = (
-                f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
-            )
+            summary = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and run it again."
             raise InputError(summary) from error
         if isinstance(error, OSError):
             summary = f"{error.filename or work} cannot be read or written ({error.strerror or error}): check the path."

@@ -211,11 +211,14 @@ def _check_camera(camera: Mapping[str, Any], radial: Sequence[Any], kind: Camera
         return
     for key, value in zip(RADIAL, radial, strict=True):
         check_number(f"The distortion {key} of {where}", value, Number())
-    # The radial polynomial must rise up to half way to a corner (a tangent, or the angle of a fisheye).
+    # The radial polynomial must rise until it reaches a pixel half way to a corner (a tangent, or a fisheye's angle).
     radius = 0.25 * math.hypot(camera["w"] / camera["fl_x"], camera["h"] / camera["fl_y"])
-    r = radius * np.linspace(0, 1, 501)
-    distorted = r + sum(float(k) * r ** (2 * n + 3) for n, k in enumerate(radial))
-    if not (np.diff(distorted) > 0).all() or distorted[-1] > STRETCH * radius:
+    r = radius * np.linspace(0, STRETCH, 2001)
+    with np.errstate(over="ignore", invalid="ignore"):
+        distorted = r + sum(float(k) * r ** (2 * n + 3) for n, k in enumerate(radial))
+        first = int(np.argmax(~(distorted < radius)))  # 0: never
+        rises = bool((np.diff(distorted[: first + 1]) > 0).all())
+    if first == 0 or not rises or r[first] < radius / STRETCH:
         said = ", ".join(f"{k} {x:g}" for k, x in zip(RADIAL, radial, strict=True) if x)
         raise InputError(
             f"The distortion of {where} ({said}) cannot be undone half way to the image's corners: give OpenCV's "

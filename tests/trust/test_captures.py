@@ -89,6 +89,7 @@ REFUSED = {
     "fisheye of instant-ngp": (file(is_fisheye=True), ["instant-ngp-data", "OPENCV_FISHEYE"]),
     "k1 is NaN": (file(k1=NAN), ["distortion k1", "nan"]),
     "k1 is huge": (file(k1=1e6), ["distortion", "cannot be undone"]),
+    "a barrel too small for its image": (file(k1=-1.96), ["distortion", "cannot be undone"]),
 }
 
 
