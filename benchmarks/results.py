@@ -73,6 +73,7 @@ VARIANTS = (
             ("four MPIs, each alone, then reliability", ()),
         )
     ),
+    Variant("kitti-street", 1, "mmpi-kitti", PAPER[2:], name="all 40,000 steps, of 1,024 rays", group="paper"),
 )
 
 
