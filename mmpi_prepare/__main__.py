@@ -51,7 +51,7 @@ def entrypoint() -> None:
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     import tyro
 
-    from mmpi_ns.utils.errors import InputError, log, used_up
+    from mmpi_ns.utils.errors import InputError, log
     from mmpi_prepare.settings import Settings
 
     settings = tyro.cli(Settings, description=Settings.__doc__)
@@ -59,11 +59,8 @@ def entrypoint() -> None:
 
     try:
         verdict = prepare(settings)
-    except Exception as error:
-        summary = error if isinstance(error, InputError) else used_up(error)
-        if summary is None:
-            raise
-        log(f"mmpi-prepare: {summary}", "bold red")
+    except InputError as error:
+        log(f"mmpi-prepare: {error}", "bold red")
         sys.exit(1)
     sys.exit(0 if verdict.grade == "right" else 3)
 

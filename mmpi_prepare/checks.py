@@ -12,7 +12,6 @@ import numpy as np
 import pycolmap
 from matplotlib.figure import Figure
 
-from mmpi_ns.data.exif import light_of
 from mmpi_ns.utils.files import write_text
 from mmpi_prepare.adjustment import WIDE, Array, adjust, camera_poses, degrees_between, is_bent, with_fewer_points
 from mmpi_prepare.evidence import local_median
@@ -26,8 +25,6 @@ degrees."""
 FOCAL_OFF, FOCAL_HELPS = (0.03, 0.05), (0.95, 0.85)
 """Relative change of a given focal length by refinement from which it, and the scene with it, is doubtful, if
 refinement lowers the reprojection error below these fractions."""
-WORST, CELLS = 5, (8, 6)
-"""Number of images with the least coverage that are listed; columns and rows of the grid for coverage."""
 
 
 @dataclass(frozen=True)
@@ -126,14 +123,6 @@ def doubtful_intrinsics(
     return findings
 
 
-def exposure_in_words(images: Sequence[Path]) -> str:
-    """Range of the exposures of images by their EXIF, in words."""
-    light = [x for x in map(light_of, images) if np.isfinite(x)]
-    if not light:
-        return "not known: no EXIF"
-    return f"varies {max(light) / min(light):.1f}-fold by the EXIF of {len(light)} images"
-
-
 def write_report(
     model: pycolmap.Reconstruction,
     title: str,
@@ -145,18 +134,11 @@ def write_report(
 ) -> None:
     """Writes report.md and report/track.png of a scene: a table of ``rows`` and the model's figures, warnings with the
     findings of the checks, which the drawing marks, and a last note."""
-    covered = {}  # share of each image's cells that hold a keypoint with a point
-    for i in model.reg_image_ids():
-        image, camera = model.images[i], model.cameras[model.images[i].camera_id]
-        seen = np.array([p.xy for p in image.points2D if p.has_point3D()]).reshape(-1, 2)
-        cell = (np.clip(seen / [camera.width, camera.height], 0, 1 - 1e-9) * CELLS).astype(int)
-        covered[image.name] = len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])
     rows = rows | {
         "reprojection error": f"{model.compute_mean_reprojection_error():.3f} px",
         "points": f"{model.num_points3D()}",
         "track length": f"{model.compute_mean_track_length():.1f} images",
         "points seen by an image": f"{model.compute_mean_observations_per_reg_image():.0f}",
-        "coverage": f"{np.mean(list(covered.values())):.0%} on average, {min(covered.values()):.0%} at least",
     }
     by_badness = sorted(findings, key=lambda f: (f.kind, -f.badness))
     warnings = [*warnings, *(f"{f.kind} {f.image + ': ' if f.image else ''}{f.summary}" for f in by_badness)]
@@ -169,8 +151,6 @@ def write_report(
         *(["## What moves\n\n![masks](report/moving.jpg)\n"] if (scene / "report/moving.jpg").is_file() else []),
         "## Cameras\n",
         *(f"- {c.model.name} {c.width}x{c.height}: {c.params_info} = {params}" for c, params in cameras),
-        "\n## Coverage\n\nShare of an image's cells (8 x 6) that hold a keypoint with a point; the least:\n",
-        *(f"- {n}: {v:.0%}" for n, v in sorted(covered.items(), key=lambda x: x[1])[:WORST]),
         f"\n## Notes\n\n- {note}",
     ]
     write_text(scene / "report.md", "\n".join(parts) + "\n")

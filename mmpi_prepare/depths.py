@@ -128,13 +128,7 @@ def write_depths(
 ) -> dict[str, str]:
     """Writes depth images, and every n-th pixel of them beside downscaled images, to ``depths`` and ``depths_n``.
 
-    Args:
-        files: by name of the photo.
-        photos: of the scene.
-        units: of the scene in a metre: 1 keeps millimetres, as whole numbers if they were; else files become .npy.
-        scene: its folder.
-        factors: of the downscaled images.
-
+    ``units``, of the scene in a metre, of 1 keep millimetres, as whole numbers if they were; else files become .npy.
     Returns the path in the scene by name of the photo.
     """
     paths = {}

@@ -243,13 +243,9 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
     A bundle adjustment that got stuck, or a track that broke, leaves such changes even if reprojection errors and
     epipolar lines show little.
 
-    Args:
-        points, frames: number of the point that each observation sees, and place of its image. [O]
-        centers, rays: of its camera, and unit, world axes. [O, 3]
-        count: registered images, N.
-
-    Returns:
-        Medians over points of the logarithm, moved three standard errors towards 0; NaN if there are few. [N - 1]
+    ``points`` and ``frames`` [O] are the point that each observation sees, and the place of its image; ``centers`` and
+    unit ``rays`` [O, 3] of its camera are in world axes. Returns medians over points of the logarithm, moved three
+    standard errors towards 0, for N = ``count`` registered images; NaN if there are few. [N - 1]
     """
     order = np.lexsort((frames, points))
     points, frames, centers, rays = points[order], frames[order], centers[order], rays[order]

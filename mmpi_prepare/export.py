@@ -1,11 +1,11 @@
-"""The scene as nerfstudio-data and mmpi read it: transforms.json, points, COLMAP model, images, masks; undistortion."""
+"""The scene as nerfstudio-data and mmpi read it: transforms.json, points, COLMAP model, images, masks."""
 
 from __future__ import annotations
 
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,12 @@ class Split:
 def split_images(
     names: Sequence[str],
     test_every: int | None = None,
-    train_every: int | None = None,
     lists: Mapping[str, Any] | None = None,
     source: str = "",
 ) -> Split:
-    """Every n-th image tests, or trains, from the middle of the first n on; or as the lists of another scene's
-    transforms.json (``source``) say, and images that they do not name are left out of both. Raises InputError if no
-    image is left to train or to test."""
+    """Every n-th image tests, from the middle of the first n on; or as the lists of another scene's transforms.json
+    (``source``) say, and images that they do not name are left out of both. Raises InputError if no image is left to
+    train or to test."""
     if lists is not None:
         sides = []
         for key in ("train_filenames", "test_filenames"):
@@ -56,15 +55,12 @@ def split_images(
     if test_every == 0:
         summary = "every image is used for training and testing (--test-every 0): scores are meaningless"
         return Split(tuple(names), tuple(names), summary)
-    every = train_every or test_every or min(8, len(names))
-    picked = {n for i, n in enumerate(names) if i % every == every // 2}
-    rest = {n for n in names if n not in picked}
-    train, test = (picked, rest) if train_every else (rest, picked)
+    every = test_every or min(8, len(names))
+    test = tuple(n for i, n in enumerate(names) if i % every == every // 2)
+    train = tuple(n for i, n in enumerate(names) if i % every != every // 2)
     if not train or not test:
         raise InputError(f"One image in {every} of {len(names)} leaves nothing to train or to test: use another.")
-    role = "trains, the others test" if train_every else "tests, the others train"
-    summary = f"one image in {every} {role}, from the {every // 2 + 1}. on"
-    return Split(tuple(n for n in names if n in train), tuple(n for n in names if n in test), summary)
+    return Split(train, test, f"one image in {every} tests, from the {every // 2 + 1}. on")
 
 
 def transforms(
@@ -76,7 +72,7 @@ def transforms(
     lenses = {number: opencv_intrinsics(camera) for number, camera in model.cameras.items()}
     kinds = {is_fisheye for _, is_fisheye in lenses.values()}
     if len(kinds) > 1:
-        raise InputError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
+        raise InputError("Fisheye and perspective lenses in one scene: prepare them separately.")
     keys = ("k1", "k2", "k3", "k4") if True in kinds else ("k1", "k2", "p1", "p2")
     entries: dict[int, dict[str, Any]] = {}
     for number, (values, _) in lenses.items():
@@ -164,53 +160,3 @@ def existing_parts(scene: Path) -> list[str]:
     """Names in a folder that a scene would use, transforms.json first."""
     parts = [p.name for p in scene.iterdir() if PART.fullmatch(p.name)] if scene.is_dir() else []
     return sorted(parts, key=lambda n: (n != "transforms.json", n))
-
-
-def undistort(
-    model: pycolmap.Reconstruction,
-    photos: Sequence[Photo],
-    images: Path,
-    masks: Path | None,
-    target: Path,
-    threads: int,
-) -> tuple[pycolmap.Reconstruction, list[Photo]]:
-    """Writes undistorted images, with their EXIF, and masks (``NAME.png``) to folders of these names in ``target``.
-
-    Returns the model with pinhole cameras and moved keypoints, and the registered photos with their new sizes.
-    """
-    (target / "bent").mkdir(parents=True)
-    model.write(target / "bent")
-    names = [photo.name for photo in photos]
-    with progress("Undistorting", 1) as advance:
-        pycolmap.undistort_images(
-            target, target / "bent", images, image_names=names, jpeg_quality=QUALITY, num_threads=threads
-        )
-        advance()
-    flat = pycolmap.Reconstruction(target / "sparse")
-    flat.update_point_3d_errors()
-    camera_of = {image.name: image.camera_id for image in model.images.values()}
-
-    def flattened(mask: Image.Image, camera: int) -> Image.Image:
-        bitmap = pycolmap.Bitmap.from_array(np.asarray(mask))
-        return Image.fromarray(
-            pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, model.cameras[camera])[0].to_array()
-        )
-
-    flat_photos = []
-    for photo in photos:
-        number = camera_of[photo.name]
-        with Image.open(images / photo.name) as image:
-            alpha = image.getchannel("A") if image.mode == "RGBA" else None
-        if alpha is not None:  # COLMAP reads colours alone
-            with Image.open(target / "images" / photo.name) as image:
-                tags = image.getexif()
-                image.putalpha(flattened(alpha, number))
-            image.save(target / "images" / photo.name, exif=tags)
-        if masks is not None:
-            (target / "masks").mkdir(exist_ok=True)
-            with Image.open(masks / f"{photo.name}.png") as mask:
-                flat_mask = flattened(mask, number).point(lambda v: 255 if v == 255 else 0)
-            flat_mask.save(target / "masks" / f"{photo.name}.png")
-        size = flat.cameras[number]
-        flat_photos.append(replace(photo, width=size.width, height=size.height, exif_focal=None))
-    return flat, flat_photos

@@ -103,9 +103,7 @@ def find_fit(poses: Array, places: Sequence[Place | None]) -> Fit | None:
 
     Up is that of GPS where the path is wide enough; else cameras are taken to be level, and altitudes are left out.
 
-    Args:
-        poses: camera to world, OpenCV axes. [N, 4, 4]
-        places: of the photos, None where they note none. [N]
+    ``poses`` are camera to world, OpenCV axes. [N, 4, 4]
     """
     noted = [i for i, place in enumerate(places) if place is not None]
     if not noted:

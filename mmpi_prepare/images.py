@@ -3,7 +3,6 @@ sharpness choose; their EXIF and masks."""
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from mmpi_ns.data.exif import kept_tags, positive_number, tags_of
 from mmpi_ns.utils.errors import InputError, log, progress
-from mmpi_ns.utils.files import opened, whole, write_text
+from mmpi_ns.utils.files import opened, whole
 from mmpi_prepare.gps import Place, place_of
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -198,10 +197,7 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     """Writes the chosen frames of a video to ``target/images``. Raises InputError if it cannot be read, or shows no
     motion."""
     (target / "images").mkdir(parents=True, exist_ok=True)
-    file = target / "measured.json"
-    if not file.exists():
-        write_text(file, json.dumps(measure(video)))
-    motion, sharp = np.array(json.loads(file.read_text(encoding="utf-8")))
+    motion, sharp = np.array(measure(video))
     chosen, used = choose_frames(motion, sharp, max_frames, step)
     frames = len(motion)
     if len(chosen) < 2:

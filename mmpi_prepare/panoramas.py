@@ -34,7 +34,7 @@ SAMPLE = 16
 """Images checked for whether those that are twice as wide as high are panoramas."""
 APART = 8
 """Columns of an image that are compared with each other."""
-OTHERS = ("poses", "depths", "focal", "camera", "lens", "intrinsics", "refine_intrinsics", "undistort")
+OTHERS = ("poses", "depths", "focal", "camera", "lens", "intrinsics", "refine_intrinsics")
 """Options for cameras that are not panoramic."""
 
 
@@ -125,9 +125,9 @@ def join(database: Path) -> None:
         pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=cameras)], opened)
 
 
-def split_panoramas(names: Sequence[str], test_every: int | None, train_every: int | None) -> Split:
+def split_panoramas(names: Sequence[str], test_every: int | None) -> Split:
     """As ``split_images``, with all faces of a panorama on one side."""
-    fronts = split_images([n for n in names if n.startswith("front-")], test_every, train_every)
+    fronts = split_images([n for n in names if n.startswith("front-")], test_every)
     train, test = (
         tuple(n for n in names if f"front-{n.partition('-')[2]}" in side) for side in (fronts.train, fronts.test)
     )

@@ -19,7 +19,7 @@ import pycolmap
 from filelock import FileLock, Timeout
 from scipy.cluster.hierarchy import DisjointSet
 
-from mmpi_ns.utils.errors import FULL, InputError, log, progress, quoted
+from mmpi_ns.utils.errors import InputError, log, progress, quoted
 from mmpi_ns.utils.files import whole, write_text
 from mmpi_prepare import checks, export, features, images, panoramas
 from mmpi_prepare.adjustment import camera_poses, choose_frame, focal_interval, keeps_focals, map_given_poses
@@ -28,7 +28,7 @@ from mmpi_prepare.gps import Fit, find_fit
 from mmpi_prepare.images import Photo, in_short, select_frames, sharpness
 from mmpi_prepare.mapping import Task, map_and_judge
 from mmpi_prepare.poses import agreeing, make_cameras, opencv_camera, read_poses
-from mmpi_prepare.settings import Settings, check, read_lists
+from mmpi_prepare.settings import Settings, check
 from mmpi_prepare.verdict import Verdict, remedy
 from mmpi_priors.sfm import load_pycolmap, match_pairs, new_model, quiet, rigid3d
 from mmpi_priors.tracks import near_pairs
@@ -36,8 +36,6 @@ from mmpi_priors.tracks import near_pairs
 WORK = ".prepare"
 WORDS = {"features": "features", "matches": "matching", "model": "mapping"}
 """The stages in words, for the times in the report; the others read."""
-LEFT = 1 << 20
-"""Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 LEAST_IMAGES = 3
 """Minimum number of images; COLMAP's mappers make no smaller model."""
 LEAST_SHARE = 0.5
@@ -256,17 +254,13 @@ class Preparation:
         names = set(camera_poses(model)[0])
         photos = [p for p in self.photos if p.name in names]
         split = self._split([p.name for p in photos])
-        folder, flat, built = self.image_folder, self.work / "undistorted", self.work / "scene"
-        shutil.rmtree(flat, ignore_errors=True)
+        built = self.work / "scene"
         shutil.rmtree(built, ignore_errors=True)
         findings, masks, moves = self._check(model, photos, split, built)
         grave = [f"{f.summary[:1].upper()}{f.summary[1:]}." for f in findings if f.is_grave]
         if grave and self.given_poses is None and verdict.grade == "right":
             verdict = Verdict("doubtful", " ".join(grave))
-        if s.undistort:
-            model, photos = export.undistort(model, photos, folder, masks, flat, s.threads)
-            folder, masks = flat / "images", flat / "masks" if masks else None
-        export.write_images(folder, masks, photos, built, s.downscales)
+        export.write_images(self.image_folder, masks, photos, built, s.downscales)
         depths = write_depths(self.depths, photos, scale / metres, built, s.downscales) if self.depths else {}
         if depths:
             log(f"Depths: {scale_note}; a metre is {scale / metres:.4g} units of the scene.")
@@ -282,7 +276,6 @@ class Preparation:
             "mapping": summary,
             "verdict": f"{verdict.grade} {verdict.summary}".strip(),
             "focal length": focal,
-            "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
             "what moves": moves,
             "depths": scale_note,
             "up": up,
@@ -291,8 +284,7 @@ class Preparation:
             "times": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.times.items()),
         }
         intrinsics = "given and kept" if self.is_fixed else "refined"
-        lens = "undone" if s.undistort else "kept in transforms.json"
-        note = f"Intrinsics {intrinsics}; {len(self.cameras)} camera(s); lens distortion {lens}."
+        note = f"Intrinsics {intrinsics}; {len(self.cameras)} camera(s)."
         groups = self.mapped["groups"]
         lost = [p.name for p in self.photos if p.name not in names.union(*groups)]
         apart = "images form a group of their own, not connected to the scene"
@@ -304,12 +296,10 @@ class Preparation:
 
     def _split(self, names: Sequence[str]) -> export.Split:
         s = self.settings
-        if s.split_from is not None:
-            return export.split_images(names, lists=read_lists(s.split_from), source=s.split_from.name)
-        if self.given_poses is not None and self.given_poses.split and s.test_every is None and s.train_every is None:
+        if self.given_poses is not None and self.given_poses.split and s.test_every is None:
             return export.split_images(names, lists=self.given_poses.split, source=f"{s.poses}")
         split = panoramas.split_panoramas if self.panoramas else export.split_images
-        return split(names, s.test_every, s.train_every)
+        return split(names, s.test_every)
 
     def _check(
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split, built: Path
@@ -340,17 +330,10 @@ class Preparation:
         findings += [checks.Finding("moving?", "", doubt)] if doubt else []
         if not moves:
             return findings, None, "not known" if doubt else "nothing is seen to move"
-        moving, fate = sum(moves.values()) / len(split.train), "are masked" if s.moving == "mask" else "move"
-        summary = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
+        moving = sum(moves.values()) / len(split.train)
+        summary = f"{moving:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, are masked"
         log(f"What moves: {summary}; report/moving.jpg shows them.")
-        if s.moving == "mask":
-            return findings, target, summary
-        words = "of the image moves: mask it (--moving mask, or --masks)"
-        return (
-            [*findings, *(checks.Finding("moving?", n, f"{x:.0%} {words}", x) for n, x in moves.items())],
-            None,
-            summary,
-        )
+        return findings, target, summary
 
     def _publish(
         self, warnings: Sequence[str], model: pycolmap.Reconstruction, verdict: Verdict, split: export.Split
@@ -378,7 +361,7 @@ class Preparation:
 
 @contextmanager
 def only_one(work: Path) -> Iterator[None]:
-    """Locks a work folder against a second run. Raises InputError if one is at work there, or the disk is full."""
+    """Locks a work folder against a second run. Raises InputError if one is at work there, or a file cannot be used."""
     try:
         work.mkdir(parents=True, exist_ok=True)
         with FileLock(work / "lock", blocking=False):
@@ -387,15 +370,9 @@ def only_one(work: Path) -> Iterator[None]:
         raise InputError(f"Another mmpi-prepare is making {work.parent}: wait for it, or name another.") from error
     except InputError:
         raise
-    except (OSError, RuntimeError, ValueError) as error:
-        free = shutil.disk_usage(next(p for p in work.parents if p.is_dir())).free
-        if getattr(error, "errno", None) in FULL or free < LEFT:
-            summary = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and run it again."
-            raise InputError(summary) from error
-        if isinstance(error, OSError):
-            summary = f"{error.filename or work} cannot be read or written ({error.strerror or error}): check the path."
-            raise InputError(summary) from error
-        raise
+    except OSError as error:
+        what = f"{error.filename or work} cannot be read or written ({error.strerror or error})"
+        raise InputError(f"{what}: check path and disk.") from error
 
 
 def prepare(s: Settings) -> Verdict:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -28,9 +27,8 @@ class Settings:
     """Folder for the scene."""
     masks: Path | None = None
     """Folder of masks named like the images; black pixels are excluded from SfM and training."""
-    moving: Literal["mask", "warn", "keep"] = "mask"
-    """Treatment of moving objects in the training images, unless --masks are given: mask them in training, warn, or
-    neither."""
+    moving: Literal["mask", "keep"] = "mask"
+    """Treatment of moving objects in the training images, unless --masks are given: mask them in training, or not."""
     depths: Path | None = None
     """Folder of depth images of an RGB-D camera, one for each image, named alike (or by time, as TUM's) and registered
     to it: 16-bit PNG in millimetres, or .npy in metres. They give the scale, unless --poses or --camera-height do."""
@@ -51,8 +49,6 @@ class Settings:
     """auto: images with the same size, EXIF body and lens share a camera."""
     refine_intrinsics: bool = False
     """Refine given intrinsics."""
-    undistort: bool = False
-    """Undistort the images instead of writing the distortion to transforms.json."""
     matching: Matching = "auto"
     """auto: all pairs of few images; neighbours and revisits of a sequence; similar images of many."""
     overlap: int = 10
@@ -63,10 +59,6 @@ class Settings:
     """Camera height above the ground in metres: sets the scale, and the up direction by the normal of the ground."""
     test_every: int | None = None
     """Every n-th image is a test image (default 8); 0: all are used for training and testing."""
-    train_every: int | None = None
-    """Every n-th image is a training image, the others are test images."""
-    split_from: Path | None = None
-    """JSON file with the train_filenames and test_filenames to use, such as another scene's transforms.json."""
     downscales: tuple[int, ...] = (2, 4)
     """Downscale factors of the copies."""
     max_frames: int = 300
@@ -88,7 +80,7 @@ class Settings:
 RANGES = {
     **dict.fromkeys(("focal", "camera_height", "frame_motion"), Number(0, above=True)),
     **dict.fromkeys(("overlap", "max_features"), Number(1, whole=True)),
-    **dict.fromkeys(("train_every", "max_frames", "downscales"), Number(2, whole=True)),
+    **dict.fromkeys(("max_frames", "downscales"), Number(2, whole=True)),
     "camera": Number(),
 }
 
@@ -96,7 +88,6 @@ RANGES = {
 def check(s: Settings) -> None:
     """Raises InputError if an option is out of range, contradicts another or names no file."""
     check_options(s, {name: number for name, number in RANGES.items() if getattr(s, name) is not None}, "--")
-    every, threads = (s.test_every, s.train_every), s.threads
     kinds = " or ".join(GIVEN_COUNTS.values())
     camera = (1.0,) * 4 if s.camera is None else s.camera
     focals = camera[: 1 if len(camera) == 3 else 2]
@@ -104,30 +95,16 @@ def check(s: Settings) -> None:
         f"--camera takes {kinds}, not {len(camera)} numbers.": len(camera) not in GIVEN_COUNTS,
         "--camera: focal lengths must be positive, in pixels.": min(focals, default=1) <= 0,
         "--focal and --camera both give a focal length: leave one out.": None not in (s.focal, s.camera),
-        "--test-every and --train-every contradict each other: leave one out.": None not in every,
         f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.": (s.test_every or 2) < 2,
         f"--downscales takes different numbers, not {s.downscales}.": len(set(s.downscales)) < len(s.downscales),
-        f"--threads takes a number of threads, or -1 for all cores, not {threads}.": threads < 1 and threads != -1,
+        f"--threads takes a number of threads, or -1 for all cores, not {s.threads}.": s.threads < 1
+        and s.threads != -1,
         "--refine-poses refines known poses: give them with --poses.": s.refine_poses and s.poses is None,
         f"--poses {s.poses} does not exist.": s.poses is not None and not s.poses.exists(),
         f"--masks {s.masks} is no folder.": s.masks is not None and not s.masks.is_dir(),
         f"--depths {s.depths} is no folder.": s.depths is not None and not s.depths.is_dir(),
-        "--depths are of images with their lens: leave --undistort out.": s.depths is not None and s.undistort,
         f"There is no {looked_at(s.input)}: check the path.": not s.input.exists(),
         f"{s.scene} is a file: name a folder for the scene.": s.scene.is_file(),
     }
     for summary in (summary for summary, is_wrong in faults.items() if is_wrong):
         raise InputError(summary)
-    if s.split_from is not None:
-        read_lists(s.split_from)
-
-
-def read_lists(path: Path) -> dict[str, list[str]]:
-    """The train and test files that a JSON file lists. Raises InputError if it cannot be read, or lists none."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return {key: [str(n) for n in content[key]] for key in ("train_filenames", "test_filenames")}
-    except (OSError, ValueError) as error:
-        raise InputError(f"--split-from {path} cannot be read ({error}).") from error
-    except (KeyError, TypeError) as error:
-        raise InputError(f"--split-from {path} needs train_filenames and test_filenames.") from error

@@ -34,8 +34,8 @@ def frames(tmp_path):
     [
         ({"focal": NAN}, "--focal"), ({"focal": -3.0}, "--focal"), ({"camera_height": 0.0}, "--camera-height"),
         ({"camera": (NAN, 1.0, 1.0)}, "--camera"), ({"camera": (9.0, 1.0, 1.0), "focal": 9.0}, "leave one out"),
-        ({"test_every": 1}, "--test-every"), ({"test_every": -4}, "--test-every"), ({"train_every": 0}, "at least 2"),
-        ({"test_every": 4, "train_every": 4}, "contradict"), ({"downscales": (2, 0)}, "--downscales"),
+        ({"test_every": 1}, "--test-every"), ({"test_every": -4}, "--test-every"),
+        ({"downscales": (2, 0)}, "--downscales"),
         ({"downscales": (2, 2)}, "--downscales"), ({"refine_poses": True}, "--poses"), ({"overlap": 0}, "--overlap"),
         ({"threads": 0}, "--threads"), ({"max_frames": 1}, "--max-frames"),
     ],
@@ -61,7 +61,7 @@ def test_a_second_run_into_a_scene_says_so_and_ends(frames, tmp_path):
 
 def test_a_scene_that_cannot_be_written_is_one_sentence(tmp_path):
     (tmp_path / "notes.txt").write_text("a file")
-    with pytest.raises(InputError, match=r"notes.txt.* cannot be read or written \(Not a directory\): check the path"):
+    with pytest.raises(InputError, match=r"notes.txt.* cannot be read or written \(Not a directory\): check"):
         with only_one(tmp_path / "notes.txt" / "scene" / WORK):
             pass
 

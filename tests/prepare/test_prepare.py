@@ -119,29 +119,6 @@ def test_interrupted_run_goes_on_without_redoing_what_was_done(capture, tmp_path
             prepare(replace(settings, max_features=500, overwrite=True))
 
 
-def test_undistorted_scene_has_no_lens_and_fits_its_points(capture, tmp_path):
-    """Frames bent by a known lens."""
-    camera = pycolmap.Camera(
-        model="OPENCV", width=corridor.WIDTH, height=corridor.HEIGHT, camera_id=1,
-        params=[corridor.FOCAL, corridor.FOCAL, 120, 80, 0.08, 0.0, 0.0, 0.0],
-    )  # fmt: skip
-    columns, rows = np.meshgrid(np.arange(corridor.WIDTH) + 0.5, np.arange(corridor.HEIGHT) + 0.5)
-    rays = camera.cam_from_img(np.stack([columns.ravel(), rows.ravel()], -1)) * corridor.FOCAL + [119.5, 79.5]
-    import cv2
-
-    bent = rays.reshape(corridor.HEIGHT, corridor.WIDTH, 2).astype(np.float32)
-    (tmp_path / "bent").mkdir()
-    for i in range(5):
-        straight = np.asarray(Image.open(capture / f"frames/frame_{i + 1:03d}.png"))
-        image = cv2.remap(straight, bent[..., 0], bent[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        Image.fromarray(image).save(tmp_path / f"bent/frame_{i + 1:03d}.png")
-    lens = (corridor.FOCAL, corridor.FOCAL, 120.0, 80.0, 0.08, 0.0, 0.0, 0.0)
-    prepare(Settings(tmp_path / "bent", tmp_path / "scene", camera=lens, undistort=True, test_every=4, threads=1))
-    content = read_json(tmp_path / "scene")
-    assert content["k1"] == content["k2"] == content["p1"] == content["p2"] == 0
-    assert pycolmap.Reconstruction(tmp_path / "scene/colmap/sparse/0").compute_mean_reprojection_error() < 0.4
-
-
 def test_ordered_poses_come_back_in_the_order_of_the_images(scene):
     names, _ = camera_poses(pycolmap.Reconstruction(scene / "colmap/sparse/0"))
     assert names == [f"frame_{i + 1:03d}.png" for i in range(COUNT)]

@@ -133,9 +133,3 @@ def test_integers_are_millimetres_and_other_numbers_metres(tmp_path):
     (tmp_path / "bad.npy").write_bytes(b"x")
     with pytest.raises(InputError, match="cannot be read"):
         read_millimetres(tmp_path / "bad.npy")
-
-
-def test_depths_and_undistortion_exclude_each_other(frames, tmp_path):
-    for more, words in (({"undistort": True}, "leave --undistort out"), ({"depths": tmp_path / "no"}, "is no folder")):
-        with pytest.raises(InputError, match=words):
-            prepare(Settings(frames, tmp_path / "scene", **({"depths": frames} | more), threads=1))

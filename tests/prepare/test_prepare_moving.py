@@ -45,9 +45,6 @@ def test_what_moves_in_training_images_is_masked_and_shown(drive, tmp_path):
     assert "of the training pixels" in report and "report/moving.jpg" in report
 
 
-@pytest.mark.parametrize("moving", ["warn", "keep"])
-def test_what_moves_is_kept_and_warned_of_where_that_is_asked_for(drive, tmp_path, moving):
-    meta = prepared(drive, tmp_path / "scene", moving=moving)
+def test_what_moves_is_kept_where_that_is_asked_for(drive, tmp_path):
+    meta = prepared(drive, tmp_path / "scene", moving="keep")
     assert not any("mask_path" in frame for frame in meta["frames"]) and not (tmp_path / "scene/masks").exists()
-    warned = [x for x in (tmp_path / "scene/report.md").read_text().splitlines() if x.startswith("- moving? frame")]
-    assert len(warned) >= 3 if moving == "warn" else not warned
