@@ -287,14 +287,8 @@ class _Problem:
 
 
 def in_words(chosen: Convention, given: Array, focal: float, as_pixels: float, was: float) -> str:
-    """Description of a convention for the user.
-
-    Args:
-        found, given: the convention, and the axes that were expected.
-        focal: the given focal length in pixels.
-        as_pixels: pixels of the width.
-        was: error as given, over the width.
-    """
+    """Description of a convention for the user: ``given`` are the axes that were expected, ``focal`` is the given focal
+    length in pixels, ``as_pixels`` the width, and ``was`` the error as given, over the width."""
     faults = []
     if not np.array_equal(chosen.axes, given):
         rows = [(int(np.abs(row).argmax()), row.sum() < 0) for row in chosen.axes]

@@ -51,8 +51,6 @@ SMALLEST = 12
 """Minimum shorter side for optical flow, pixels."""
 ROUNDS, SEARCHED = {False: (1, 1, 1), True: (2, 1)}, {False: (1, 1), True: (1,)}
 """Rounds of matching, of small and of large images, at the working size divided by this; and with surfaces."""
-SECONDS, SEARCH_SECONDS = 0.55, 0.15
-"""Processor seconds for a million working pixels of an image, and for its surfaces, for the forecast."""
 STRIDE, COMPARISONS = {False: 5, True: 6}, 6
 """Pixels between patches of the optical flow, in small and in large images, and most comparisons of each."""
 NOISE, MAX_EPIPOLAR = 0.3, 1.0

@@ -25,12 +25,12 @@ from mmpi_ns.data.posed_images import PosedImages, at_full_size, posed_images
 from mmpi_ns.data.priors import UNKNOWN, Codes, DepthPriors, packed, unpacked
 from mmpi_ns.data.rays import Rays
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.utils.errors import duration, log
+from mmpi_ns.utils.errors import log
 from mmpi_ns.utils.host import give_back_freed_memory
-from mmpi_ns.utils.parallel import in_order, num_threads
+from mmpi_ns.utils.parallel import in_order
 from mmpi_priors.cache import Computed, digest, kept
 from mmpi_priors.clouds import POINT_ERROR, contradict, see_points
-from mmpi_priors.dense import SEARCH_SECONDS, SECONDS, Depth, find_depths
+from mmpi_priors.dense import Depth, find_depths
 from mmpi_priors.lone_depth import continued, is_lone
 from mmpi_priors.observe import drop_masked
 from mmpi_priors.views import Map, View, look_up, straightened, strips
@@ -102,13 +102,7 @@ def _matched_depths(original: PosedImages, posed: PosedImages, observations: Obs
     side = int(min(LONGEST, longest * min(FINER, (MOST_WORKING / pixels) ** 0.5)))
 
     def match() -> Iterable[Codes]:
-        threads = num_threads()
-        working = sum(float(min(1, side / max(w, h)) ** 2 * w * h) for w, h in original.sizes)
-        seconds = (SECONDS * 1e-6 * working + SEARCH_SECONDS * len(shapes)) / threads
-        CONSOLE.print(
-            f"Matching {len(shapes)} images densely, at most {side} pixels wide or high: about {duration(seconds)} "
-            f"with {threads} thread(s)."
-        )
+        CONSOLE.print(f"Matching {len(shapes)} images densely, at most {side} pixels wide or high.")
         return find_depths(
             original, lambda i: points[seen_by == i], side,
             lambda i, view, depth: packed(at_training_pixels(view, depth, posed, i, shapes[i])),

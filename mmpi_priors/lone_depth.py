@@ -34,12 +34,8 @@ and colours are more reliable."""
 def continued(depths: Map, directions: Map) -> Map:
     """Inverse distances of pixels without a depth, from planes fitted to the pixels with one around them.
 
-    Args:
-        depths: [H, W, 2] inverse distance, 0 where unknown, and its expected error.
-        directions: [H, W, 3] unit directions of the pixels.
-
-    Returns:
-        [H, W, 2] the same for the other pixels only: 0 where ``depths`` has one, and where no plane fits.
+    ``depths`` [H, W, 2] are inverse distances, 0 where unknown, and their expected errors, ``directions`` [H, W, 3] are
+    of unit length. Returns the same as ``depths`` for the other pixels only: 0 where no plane fits.
     """
     inverse, error = depths[..., 0].astype(np.float64), depths[..., 1].astype(np.float64)
     has_depth = inverse > 0

@@ -23,7 +23,6 @@ from rich.progress import track
 
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.scene.near_views import nearest_views
-from mmpi_ns.utils.errors import duration
 from mmpi_ns.utils.files import opened
 from mmpi_ns.utils.parallel import in_order, num_threads, one_thread_each
 from mmpi_priors.cache import Arrays, Computed, kept
@@ -53,8 +52,6 @@ FURTHER, SIDES, ASIDE = 2, 8, 0.005
 image's; minimum share of an image that is newly masked there."""
 EDGE = 0.4
 """Share of moving pixels around a pixel from which it is masked."""
-SECONDS = 0.35
-"""Processor seconds for an image, for the forecast."""
 LARGE = 0.015
 """Minimum share of masked pixels in the image that has most; below it nothing is masked."""
 COMPARED, FIRST, FEW = 0.02, 0.06, 30
@@ -80,13 +77,8 @@ def find_moving(
     progress: Progress = lambda work, _: work,
 ) -> tuple[list[View], list[Mask], str]:
     """Views of images at working size, masks of moving objects in them, and a sentence why the masks are doubtful, if
-    they are; the number of threads does not change the result.
-
-    Args:
-        images: the originals.
-        points_of: SfM points [P, 3] of an image.
-        progress: wraps the images as they are worked on.
-    """
+    they are; the number of threads does not change the result. ``images`` are the originals, ``points_of`` gives the
+    SfM points [P, 3] of one, and ``progress`` wraps the images as they are worked on."""
     up = upright(images.camera_to_worlds)
 
     def shot_of(i: int, view: View, depth: Depth) -> Shot:
@@ -175,15 +167,8 @@ def too_few_depths(shots: Sequence[Shot]) -> str:
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:
-    """A mask of an image's undistorted view as a mask of the image itself.
-
-    Args:
-        view: the image at working size.
-        mask: of the view.
-        images: the originals.
-        i: the image's place in them.
-        shape: height and width of the result; the image may be a copy of another size.
-    """
+    """A mask of the undistorted view of image i of the originals as a mask of the image itself, which may be a copy of
+    another size: ``shape`` is its height and width."""
     x, y = straightened(images, i, shape)
     fx, fy, cx, cy = view.pinhole
     return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE
@@ -196,18 +181,11 @@ def moving_masks(
     points: NDArray[np.float64],
 ) -> tuple[Sequence[Mask], str]:
     """Masks of moving objects in each image [H, W], and the doubt of ``find_moving``, from the cache if possible.
-
-    Args:
-        images: the originals.
-        shapes: height and width of each mask; images may be trained on at another size.
-        seen_by: image of each observation of a point. [N]
-        points: observed points. [N, 3]
-    """
+    ``images`` are the originals, ``shapes`` height and width of each mask, ``seen_by`` the image [N] of each observed
+    point [N, 3]."""
 
     def find() -> Arrays:
         deque(in_order(_decode, images.files), maxlen=0)  # names a damaged file, for which OpenCV would print warnings
-        forecast = duration(SECONDS * len(shapes) / num_threads())
-        CONSOLE.print(f"Searching {len(shapes)} images for moving objects: about {forecast}.")
         views, masks, doubt = find_moving(
             images, lambda i: points[seen_by == i],
             progress=lambda work, count: track(work, "Moving objects", count, console=CONSOLE),

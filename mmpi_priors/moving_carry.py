@@ -52,14 +52,8 @@ class Carried:
 
 
 def carried(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask], mask: Mask) -> Carried:
-    """Objects that move in the nearest neighbours of a shot, at their positions in the shot.
-
-    Args:
-        shot: the image.
-        others: its neighbours, nearest first.
-        masks: of moving objects in each. [h, w]
-        mask: of moving objects in the shot so far. [h, w]
-    """
+    """Objects that move in the nearest neighbours of a shot (``masks`` in each, nearest first), at their positions in
+    the shot; ``mask`` [h, w] has those of the shot so far."""
     nothing, measured = np.zeros(shot.view.gray.shape, bool), shot.depth.inverse[shot.depth.inverse > 0]
     if shot.ground is None or not len(measured) or not any(mask.any() for mask in masks[:AFTER]):
         return Carried(nothing, nothing)

@@ -30,13 +30,8 @@ between images (a hand-held camera turns by degrees at each step)."""
 
 def doubt_of(shots: Sequence[Shot], up: NDArray[np.float64], masks: Sequence[Mask]) -> str:
     """Sentence on why masks of a drive are doubtful; empty if they are not, or if the capture is not a drive: a camera
-    that looks along its path, turns as little as a car, and is close above a road if it sees one.
-
-    Args:
-        shots: of the capture.
-        up: unit vector in the world. [3]
-        masks: of the shots. [h, w] each
-    """
+    that looks along its path, turns as little as a car, and is close above a road if it sees one. ``up`` is a unit
+    vector in the world."""
     if len(shots) < MANY:
         return ""
     views, grounds = [shot.view for shot in shots], sum(shot.ground is not None for shot in shots)

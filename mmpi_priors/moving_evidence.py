@@ -304,14 +304,8 @@ def two_least(levels: Sequence[Bytes]) -> tuple[Bytes, Bytes]:
 
 
 def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], impossible: Mask) -> Evidence:
-    """Evidence of pixels of a shot that match no static scene.
-
-    Args:
-        shot: the image.
-        others: its neighbours.
-        masks: of moving objects in each neighbour so far. [h, w]
-        impossible: mask of pixels that match only at an impossible depth (``moving_sweep.py``). [h, w]
-    """
+    """Evidence of pixels of a shot that match no static scene, from its neighbours, the masks of moving objects in each
+    so far, and that of pixels that match only at an impossible depth (``moving_sweep.py``). [h, w] each"""
     shape = shot.view.gray.shape
     if len(others) < 2:
         nothing = np.zeros(shape, np.uint8)

@@ -70,14 +70,8 @@ class Half:
 def upright_objects(
     shots: Sequence[Shot], near: Sequence[Sequence[int]], masks: Sequence[Mask], pool: ThreadPoolExecutor
 ) -> list[Mask]:
-    """Tall objects that move in other shots, at their positions in each shot, without their outlines. [h, w] each
-
-    Args:
-        shots: the images.
-        near: the neighbours of each, nearest first.
-        masks: of moving objects in each. [h, w]
-        pool: for several images at a time.
-    """
+    """Tall objects that move in other shots (``masks`` of each), at their positions in each shot, without their
+    outlines. [h, w] each. ``near`` are the neighbours of each, nearest first."""
     result = [np.zeros_like(mask) for mask in masks]
     if not any(mask.any() for mask in masks):
         return result

@@ -33,10 +33,7 @@ def outlined(
     """A mask without the pixels around its seeds that match the static scene, and with those next to it that do not.
 
     Args:
-        shot: the image.
-        others: its neighbours.
-        masks: of moving objects in each. [h, w]
-        mask: of moving objects in the shot. [h, w]
+        masks: of moving objects in each neighbour, as ``mask`` in the shot. [h, w]
         core: seeds, which remain; so do objects without any. [h, w]
         noise: gray levels by which static surfaces differ from their matches.
     """

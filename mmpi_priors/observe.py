@@ -62,7 +62,6 @@ def observe(
     """The observations of a training data set. Raises InputError for poses or intrinsics that cannot be used.
 
     Args:
-        outputs, dataset: the training images, as the data parser lists them and as they are read.
         parser: settings of the data parser, whose COLMAP model is read if it has one.
         sfm_path: of a COLMAP model beside the frames otherwise; it need not exist.
         find_points, triangulates: search the images for points if there are no tracks; first by matched features.

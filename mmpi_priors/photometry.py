@@ -212,13 +212,8 @@ def solve(
     ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] | None = None, *, gains: bool = True
 ) -> tuple[Float[ndarray, "N 3"], Float[ndarray, "N"], Float[ndarray, "2 3"]]:
     """Log gains of ``count`` images, their errors, and the fall-off towards the corners, by robust least squares.
-
-    Args:
-        ratios: colours of pairs of images.
-        count: N.
-        exposures: light of each image by its EXIF, in any unit; NaN where unknown.
-        gains: False solves for the fall-off alone.
-    """
+    ``exposures``: light of each image by its EXIF, in any unit; NaN where unknown. Without ``gains`` the fall-off
+    alone."""
     rows = np.arange(len(ratios.first))
     entries = [(rows, ratios.second, 1.0), (rows, ratios.first, -1.0)] if gains else []
     entries += [(rows, np.full(len(rows), count + n), ratios.falloff[:, n]) for n in range(2)]

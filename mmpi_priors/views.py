@@ -21,7 +21,7 @@ from mmpi_priors.ops.matches import place_pixels
 Map = NDArray[np.float32]
 
 REMAP_SIDE, REMAP_PART = 32766, 8192
-"""Largest side of an image for OpenCV's remap, and side of the parts into which larger ones are cut."""
+"""Largest side of an image for OpenCV's remap, and side of rows into which longer lists of places are folded."""
 STRIP = 2**16
 """Pixels processed at once: their values stay in a core's cache."""
 
@@ -208,21 +208,11 @@ def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
 def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: bool = False) -> NDArray[Any]:
     """Values of an image at pixel positions, centres at halves: interpolated, or the nearest pixel's and 0 outside.
 
-    The image [H, W] or [H, W, C] may have any size, and the places any one shape, which the values have, too.
+    The image is [H, W] or [H, W, C]; the places have any one shape, which the values have, too.
     """
-    # OpenCV counts rows and columns in 16 bits: large images are read in parts, and places are folded into rows.
-    if not x.size or max(image.shape[:2]) > REMAP_SIDE:
-        values = np.zeros((*x.shape, *image.shape[2:]), image.dtype)
-        x, y = x.astype(np.float32), y.astype(np.float32)
-        down, right = (
-            np.clip((c - 0.5) // REMAP_PART, 0, (n - 1) // REMAP_PART).astype(int)
-            for c, n in zip((y, x), image.shape[:2], strict=True)
-        )
-        for row, column in np.unique([down.reshape(-1), right.reshape(-1)], axis=1).T:
-            chosen, top, left = (down == row) & (right == column), REMAP_PART * row, REMAP_PART * column
-            part = image[top : top + REMAP_PART + 1, left : left + REMAP_PART + 1]  # one more, to interpolate with
-            values[chosen] = look_up(part, x[chosen] - left, y[chosen] - top, nearest=nearest)
-        return values
+    if not x.size:
+        return np.zeros((*x.shape, *image.shape[2:]), image.dtype)
+    # OpenCV counts rows and columns in 16 bits: places are folded into rows.
     at: Any = [np.subtract(c, 0.5, dtype=np.float32) for c in (x, y)]
     if x.ndim != 2 or max(x.shape) > REMAP_SIDE:
         width = x.size if x.size <= REMAP_SIDE else REMAP_PART
