@@ -85,16 +85,13 @@ def log_shares(
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """log P and log(1 - P) of samples among the heads that cover them, with gradients to the reliability.
 
-    A head covers a point in its frustum if the nearest texel was trained; a sample's head always covers it.
+    A head covers a point in its frustum if the nearest texel was trained (``touched`` [T]: 1 if a training ray read the
+    row); a sample's head always covers it.
 
     Args:
-        layout: of the scene.
         reliability: R of all texels.
-        touched: for every row [T]: 1 if a training ray read it.
-        rays: ray of each sample.
+        rays, inverse_t, heads: ray, inverse distance and head of each sample.
         local: the rays in every head's axes.
-        inverse_t: inverse distance of each sample.
-        heads: head that each sample was taken from.
     """
     chosen, texels, cover = [], [], []
     for head in heads_of(layout):
@@ -123,14 +120,8 @@ def head_shares(
     reliability: Float[Tensor, "T 1"],
     touched: Tensor,
 ) -> Float[Tensor, "N H"]:
-    """P of every head at points; 0 where a head does not cover one, and all 0 where none does.
-
-    Args:
-        heads: of the scene.
-        places: the points' NDC in each head, and whether they lie inside of it (``place_points``).
-        reliability: R of all texels.
-        touched: for every row [T]: 1 if a training ray read it.
-    """
+    """P of every head at points; 0 where a head does not cover one, and all 0 where none does. ``places`` are from
+    ``place_points``, the tables as in ``log_shares``."""
     covers = torch.stack([head.covers(touched, *place) for head, place in zip(heads, places, strict=True)], -1)
     values = [head.values(reliability, ndc)[:, 0] for head, (ndc, _) in zip(heads, places, strict=True)]
     values = torch.stack(values, -1).masked_fill(~covers, torch.finfo(reliability.dtype).min)

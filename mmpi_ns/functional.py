@@ -22,7 +22,6 @@ from mmpi_ns.settings import MMPIModelConfig
 from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.parallel import torch_apart
-from mmpi_ns.utils.values import Number, check_number
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +144,8 @@ def render(
         Images [*N, H, W, .] on the scene's device; [H, W, .] for one pose [3, 4].
 
     Raises:
-        InputError: a shape or a number is wrong.
+        InputError: a shape is wrong, or intrinsics have a skew.
     """
-    for name, size in (("width", width), ("height", height)):
-        check_number(f"The {name} of images", size, Number(1, whole=True))
     poses, lenses = (torch.as_tensor(x, dtype=torch.float32).cpu() for x in (camera_to_worlds, intrinsics))
     if poses.shape[-2:] not in ((3, 4), (4, 4)) or not poses.numel():
         raise InputError(f"camera_to_worlds must be [*N, 3, 4] or [*N, 4, 4], not {list(poses.shape)}.")
@@ -156,10 +153,8 @@ def render(
     if lenses.shape not in ((3, 3), (*batch, 3, 3)):
         raise InputError(f"intrinsics must be [3, 3] or {[*batch, 3, 3]}, not {list(lenses.shape)}.")
     poses, lenses = poses.reshape(-1, *poses.shape[-2:])[:, :3], lenses.expand(*batch, 3, 3).reshape(-1, 3, 3)
-    if not bool(poses.isfinite().all() and lenses.isfinite().all()):
-        raise InputError("camera_to_worlds and intrinsics must be finite numbers.")
-    if bool((lenses[:, [0, 1], [0, 1]] <= 0).any()) or bool(lenses[:, [0, 1], [1, 0]].any()):
-        raise InputError("Focal lengths in intrinsics must be positive, and cameras are rendered without skew.")
+    if bool(lenses[:, [0, 1], [1, 0]].any()):
+        raise InputError("Cameras are rendered without skew, and these intrinsics have one.")
     fx, fy, cx, cy = (lenses[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     cameras = Cameras(poses, fx, fy, cx, cy, width, height)
     outputs = [scene._render(cameras[i : i + 1].to(scene.device)) for i in range(len(poses))]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from threading import current_thread, main_thread
 from typing import Any
 
 import torch
@@ -18,7 +17,7 @@ from torch.nn import Parameter
 
 from mmpi_ns.data.datamanager import CAPTURE, Capture
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.field.mmpi_field import MMPIField, sample_bytes
+from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import Capacity, MarchOptions
 from mmpi_ns.placement.defaults import steps_for
@@ -42,8 +41,8 @@ from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.settings import MMPIModelConfig, PlacementConfig
 from mmpi_ns.training.checkpoints import last_checkpoint
-from mmpi_ns.training.losses import batch_losses, over_background, photometric
-from mmpi_ns.training.memory import Work, fit_memory
+from mmpi_ns.training.losses import batch_losses, over_background
+from mmpi_ns.training.memory import Work, check_memory
 from mmpi_ns.training.phases import make_schedule
 from mmpi_ns.training.reliability import assign_heads, blends_in
 from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
@@ -67,16 +66,12 @@ class MMPIModel(Model):
         views = None if capture is None else capture.views
         sized = replace(config.placement, max_texels=config.size * config.placement.max_texels)
         windows = self._plan(sized)
-        if capture is not None:  # fewer texels than the rule's, where memory is short
-            joint, placement = self._is_joint(windows), sized
-            work = Work(
-                config.colour.feature_channels, not joint, capture.rays_per_step,
-                all_mpis=not joint and config.schedule.rays_per_mpi == "all", sample_bytes=sample_bytes(config.colour),
-            )  # fmt: skip
-            fixed = config.plan_file is not None or placement.arrangement != "automatic"
-            again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))
-            windows = fit_memory(windows, lambda window: views_of(window, views), work, device, again)
-        phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
+        # A single head always trains alone.
+        joint = config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
+        if capture is not None:
+            work = Work(config.colour.feature_channels, two_phase=not joint)
+            check_memory(windows, lambda window: views_of(window, views), work, device)
+        phases = replace(config.schedule, training="joint" if joint else "two-phase")
         count = len(windows)
         schedule = make_schedule(phases, max(1, config.total_steps), count, capture is not None and capture.has_depths)
         self.progress = Progress(windows, schedule)
@@ -106,10 +101,6 @@ class MMPIModel(Model):
         release, adjustments = config.schedule.release_weight, [*self.camera_optimizer.parameters()]
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, adjustments, scale_is_free)
         self.register_load_state_dict_post_hook(type(self)._take_plan)
-
-    def _is_joint(self, windows: WindowedPlan) -> bool:
-        """Whether all MPIs train jointly; a single head always does."""
-        return self.config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
 
     def _plan(self, placement: PlacementConfig) -> WindowedPlan:
         """Scene plan of the option, or of the placement rule for the observations of the training cameras."""
@@ -216,13 +207,7 @@ class MMPIModel(Model):
     # Images ------------------------------------------------------------------------------------------------------
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Renders a camera's image, or the part inside a box. Raises InputError if either has no size."""
-        # In the viewer an error would end the render thread while the user types a size: it shows the background.
-        if obb_box is not None and not bool((obb_box.S > 0).all()) and current_thread() is main_thread():
-            raise InputError(
-                f"The crop box has no size (its sides are {[round(float(s), 6) for s in obb_box.S]}): give crop_scale "
-                "three positive lengths, or leave the crop out."
-            )
+        """Renders a camera's image, or the part inside a box. Raises InputError if it has no size."""
         width, height = int(camera.width), int(camera.height)
         if min(width, height) < 1:
             raise InputError(f"An image of {width} x {height} pixels shows nothing: give a smaller --downscale-factor.")
@@ -272,8 +257,6 @@ class MMPIModel(Model):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        if "training" not in outputs:  # an evaluation batch during training
-            return {"rgb_loss": photometric(outputs["rgb"], self.observed(batch))}
         rays, image, step = outputs["training"], batch["image"].to(self.device), self.progress.step
         g, decay = self.draws.of(step, "background"), self.progress.schedule.decay(step)
         if not self.draws.recording:
@@ -288,8 +271,6 @@ class MMPIModel(Model):
         return total
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Any]:
-        if "training" not in outputs:
-            return {"psnr": -10 * torch.log10(photometric(outputs["rgb"], self.observed(batch)))}
         samples = outputs["training"].samples
         intersected, kept = samples.num_intersected.float().mean(), samples.valid.sum(-1).float().mean()
         counts = {"intersected_samples": intersected, "kept_samples": kept, "dropped_mass": samples.dropped_mass.mean()}

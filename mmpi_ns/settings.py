@@ -36,10 +36,6 @@ class Later:
         return getattr(import_module(self.module), self.name)(*args, **kwargs)
 
 
-CHECKED = Later("mmpi_ns.training.options", "checked")
-"""Checks settings, locks the run's folder and returns the settings for its config.yml."""
-
-
 @dataclass
 class PlacementConfig:
     """Placement and resolution of the MPIs."""
@@ -241,5 +237,5 @@ class MMPITrainerConfig(TrainerConfig):
         log(f"All settings of this run: {self.get_base_dir() / 'config.yml'}")
 
     def save_config(self) -> None:
-        """Checks the options, locks the run's folder, and writes config.yml (``training/options.py``)."""
-        TrainerConfig.save_config(CHECKED(self))
+        """Checks the options, makes the run's folder, and writes config.yml (``training/options.py``)."""
+        TrainerConfig.save_config(Later("mmpi_ns.training.options", "checked")(self))

@@ -93,16 +93,13 @@ class CapturePriors(PriorsMaker):
         images: Sequence[int],
         device: str | torch.device,
         exposures: Float[Tensor, "M 3"] | None,
-    ) -> tuple[SharedPoints | None, str]:
-        """Points that two of the images, by number, see at the same depth; and why there are none."""
-        if priors.depths is None or priors.depths.share == 0:
-            return None, "no pixel has a depth prior"
+    ) -> SharedPoints | None:
+        """Points that two of the images, by number, see at the same depth; None without any."""
         posed = posed_images(priors.observations, self.dataset)
-        if posed is None:
-            return None, "a camera is neither perspective nor fisheye"
+        if posed is None or priors.depths is None or priors.depths.share == 0:
+            return None
         chosen = images, self.seed, device, exposures
-        points = find_shared_points(self.dataset, posed, priors.depths, self.rays, *chosen)
-        return points, "" if points is not None else "no two images show a point at the same depth"
+        return find_shared_points(self.dataset, posed, priors.depths, self.rays, *chosen)
 
     def exposure_of(
         self,
@@ -113,6 +110,8 @@ class CapturePriors(PriorsMaker):
         observed: Float[Tensor, "H W 3"],
         outputs: dict[str, Tensor],
     ) -> Float[Tensor, "3"] | None:
+        """Exposure of an evaluated image, by surfaces that training images near it see too (``exposure_of_image``);
+        None without any, or if the images are missing."""
         posed = posed_images(observations, self.dataset)
         if posed is None:
             return None

@@ -168,17 +168,13 @@ def test_what_is_no_scene_is_one_sentence(tmp_path, run):
 def test_cameras_that_cannot_be_rendered_are_one_sentence(baked):
     scene = mmpi_show.load(baked, device="cpu")
     pose, lens = scene.path.camera_to_worlds[0], scene.path.intrinsics[0]
-    skewed, flat = lens.clone(), lens.clone()
-    skewed[0, 1], flat[1, 1] = 0.1, 0.0
+    skewed = lens.clone()
+    skewed[0, 1] = 0.1
     for changes, words in (
-        ({"width": 0}, "The width of images must be a whole number"),
-        ({"height": 2.5}, "The height of images"),
         ({"camera_to_worlds": pose[:, :3]}, r"camera_to_worlds must be \[\*N, 3, 4\]"),
         ({"camera_to_worlds": pose[None][:0]}, "camera_to_worlds must be"),
         ({"intrinsics": lens[None]}, "intrinsics must be"),
-        ({"camera_to_worlds": pose * torch.nan}, "finite"),
         ({"intrinsics": skewed}, "without skew"),
-        ({"intrinsics": flat}, "positive"),
     ):
         camera = {"camera_to_worlds": pose, "intrinsics": lens, "width": 8, "height": 6} | changes
         with pytest.raises(InputError, match=words) as caught:

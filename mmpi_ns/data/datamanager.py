@@ -19,7 +19,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.data.checks import check_transforms, log_once
+from mmpi_ns.data.checks import check_transforms
 from mmpi_ns.data.copies import fit_cameras
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.priors import Gains, Priors, PriorsConfig
@@ -178,14 +178,13 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             self.sources = self._resident = self._read_sources(None)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
-        """Draws from these training cameras from now on, None for all, and prints the share of each source. Raises
-        InputError if an image cannot be used, or the masks leave no pixel."""
+        """Draws from these training cameras from now on, None for all. Raises InputError if an image cannot be
+        used, or the masks leave no pixel."""
         if self._resident is None:
             self.sources = None  # before the next pixels are read
             self.sources = self._read_sources(cameras)
         else:
             self.sources = self._resident if cameras is None else self._resident.of_images(cameras)
-        log_once(self.sources.describe(self.get_train_rays_per_batch()))
 
     def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
         """Pixels, new views and keypoints of all training cameras, or of some; prints if only a subset of the pixels is
@@ -202,12 +201,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         )  # fmt: skip
         exposures = None if gains is None else torch.from_numpy(gains.from_field).float().to(self.device)
         pixels = PixelPool.from_dataset(self.train_dataset, self.device, images, depths, most, config.seed)
-        new_views, no_new_views = None, "--pipeline.datamanager.new-view-share 0"
-        if config.new_view_share > 0 and find is not None:
-            new_views, no_new_views = find(images, self.device, exposures)
+        new_views = None if find is None or config.new_view_share == 0 else find(images, self.device, exposures)
         keypoints = None if self.priors is None else rays_to_keypoints(self.observations, self.device, images)
         counts, rays = (config.new_view_share, config.keypoint_rays), self.train_ray_generator
-        return RaySources(pixels, new_views, keypoints, rays, *counts, no_new_views, exposures)
+        return RaySources(pixels, new_views, keypoints, rays, *counts, exposures)
 
     def describe(self) -> str:
         """Size of the capture in images, points and depths, in one line."""
@@ -221,18 +218,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             parts.append(f"{100 * self.priors.depths.share:.0f} % of the training pixels have a depth prior")
         return f"Capture: {'; '.join(parts)}."
 
-    def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
-        """Maximum bytes of the training pixels in memory while these cameras are in use."""
-        if self._resident is not None:
-            return self._resident.pixels.nbytes
-        sizes = self._pixels if cameras is None else self._pixels[cameras]
-        dataset, most = self.train_dataset, int(self.config.resident_pixels)
-        share = min(1.0, most / sizes.sum()) if most else 1.0
-        # As in ``PixelPool``: colour, position in the image where it must be stored, and depth.
-        place, depth = share < 1 or dataset.has_masks, self.priors is not None and self.priors.depths is not None
-        each = (4 if dataset.has_alpha else 3) + 4 * place + 4 * depth
-        return each * sum(int(share * size) for size in sizes.tolist())
-
     def setup_eval(self) -> None:
         """nerfstudio's loaders, except the one that holds every evaluation image in memory."""
         sizes = self.eval_dataset.cameras.width * self.eval_dataset.cameras.height
@@ -244,21 +229,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         loaders = {"input_dataset": self.eval_dataset, "device": self.device, "num_workers": 4}
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**loaders)
         self.eval_dataloader = RandIndicesEvalDataloader(**loaders)
-
-    def next_eval(self, step: int) -> tuple[RayBundle, dict]:
-        """Pixels of one evaluation image, keyed on (seed, step)."""
-        self.eval_count += 1
-        g = generator(self.config.seed, step, "evaluation", "cpu")
-        number = int(torch.randint(len(self.eval_dataset), (1,), generator=g))
-        data = self.eval_dataset[number]
-        usable = data["mask"][..., 0] if "mask" in data else torch.ones(data["image"].shape[:2], dtype=torch.bool)
-        pixels = usable.nonzero()
-        if not len(pixels):
-            raise InputError(f"The mask of {self.eval_dataset.image_filenames[number]} leaves no pixel: correct it.")
-        chosen = pixels[torch.randint(len(pixels), (self.config.eval_num_rays_per_batch,), generator=g)]
-        batch = {name: data[name][chosen[:, 0], chosen[:, 1]] for name in ("image", "distance") if name in data}
-        batch["indices"] = torch.cat([torch.full_like(chosen[:, :1], number), chosen], -1)
-        return self.eval_ray_generator(batch["indices"]), batch
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``; with several threads, those of the next

@@ -12,7 +12,6 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Float, Int, Int16, UInt8
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.base_config import InstantiateConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
@@ -103,22 +102,16 @@ class Gains:
 
     def describe(self) -> str:
         """Whether and how much exposure varies, in one sentence."""
-        before, after, error = (100 * x for x in (self.disagreement, self.corrected, float(np.median(self.errors))))
-        if not self.matter and self.confirmed and np.log(self.span) > SPAN:
+        differ = f"where images show the same, colours differ by {100 * self.disagreement:.1f} %"
+        if self.matter:
             return (
-                f"Exposure is not corrected: where images show the same, colours differ by {before:.1f} %, but too few "
-                f"surfaces are shared to tell by how much exposures do (expected error {error:.1f} %)."
+                f"Exposure varies {self.span:.2f}-fold between images and is corrected: {differ}, and corrected by "
+                f"{100 * self.corrected:.1f} %."
             )
-        if not self.matter and self.confirmed:
-            return f"Exposure hardly varies: where images show the same, colours differ by {before:.1f} %."
-        if not self.matter:
-            return (
-                f"Exposure is not corrected: where images show the same, colours differ by {before:.1f} %, and a "
-                "factor for each image does not lessen that."
-            )
+        error = 100 * float(np.median(self.errors))
         return (
-            f"Exposure varies {self.span:.2f}-fold between images and is corrected: where two show the same, colours "
-            f"that differed by {before:.1f} % differ by {after:.1f} %."
+            f"Exposure is not corrected: {differ}; with a factor for each image, known to {error:.1f} %, by "
+            f"{100 * self.corrected:.1f} %."
         )
 
     @property
@@ -202,9 +195,9 @@ class Priors:
     """Share of moving pixels, in a sentence; empty if it was not computed."""
     gains: Gains | None = None
     """Exposures of the images; None if they are equal."""
-    new_views: Callable[..., tuple[SharedPoints | None, str]] | None = None
-    """Points that two of some images see at the same depth, and the reason where there are none, for images, a device
-    and exposures; None if they were not computed."""
+    new_views: Callable[..., SharedPoints | None] | None = None
+    """Points that two of some images see at the same depth, if any, for images, a device and exposures; None if they
+    were not computed."""
 
 
 @dataclass
@@ -215,16 +208,8 @@ class PriorsConfig(InstantiateConfig):
 
 
 class PriorsMaker:
-    """Maker of the record from the cameras alone. ``mmpi_priors`` has one that uses the images.
-
-    Args:
-        config: which priors.
-        outputs: of the data parser, for the training images.
-        dataset: the training images.
-        parser: settings of the data parser.
-        rays: makes rays through pixels of the training images.
-        seed: of all random draws.
-    """
+    """Maker of the record from the cameras alone. ``mmpi_priors`` has one that uses the images. ``outputs`` and
+    ``dataset`` are the training images', ``rays`` makes rays through their pixels."""
 
     def __init__(
         self,
@@ -245,25 +230,3 @@ class PriorsMaker:
         """All priors. Raises InputError naming an image, mask or depth image that cannot be used."""
         observations = self.observe(find_points=True)
         return Priors(observations, observations)
-
-    def exposure_of(
-        self,
-        observations: Observations,
-        factors: Float[Tensor, "M 3"],
-        falloff: Float[Tensor, "2 3"],
-        camera: Cameras,
-        observed: Float[Tensor, "H W 3"],
-        outputs: dict[str, Tensor],
-    ) -> Float[Tensor, "3"] | None:
-        """Exposure of an evaluated image, by surfaces that training images near it see too; None without any, or if the
-        images are missing.
-
-        Args:
-            observations: of the training cameras.
-            factors: exposures of the training images.
-            falloff: of colours towards the corners.
-            camera: of the evaluated image.
-            observed: its colours.
-            outputs: its rendering, for the depths.
-        """
-        return None

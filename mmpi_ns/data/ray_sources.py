@@ -106,11 +106,6 @@ class PixelPool:
         depths = nothing if self.depths is None else unpacked(self.depths[chosen])
         return self.colors[chosen].float() / 255, indices, depths
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the pixels themselves."""
-        return sum(x.nbytes for x in (self.colors, self.places, self.depths) if x is not None)
-
 
 def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
     """The pixels of an image, and the indices to keep: a share of the pixels outside the mask."""
@@ -159,8 +154,6 @@ class RaySources:
     """Rays of new views for each pixel ray."""
     keypoint_rays: int
     """Keypoint rays of a step without new views."""
-    no_new_views: str
-    """Reason why there are no new views, if there are none."""
     exposures: Float[Tensor, "M 3"] | None = None
     """Colour in each training image over colour in the field; None if all have the same exposure."""
 
@@ -179,7 +172,6 @@ class RaySources:
             pixels=replace(pool, **{n: getattr(pool, n)[left] for n in ("images", "widths", "begins", "ends")}),
             new_views=self.new_views and self.new_views.of_images(numbers),
             keypoints=keypoints,
-            no_new_views=self.no_new_views if self.new_views is None else "no two of these images show a point alike",
         )
 
     def counts(self, pixel_rays: int) -> tuple[int, int, int]:
@@ -189,18 +181,6 @@ class RaySources:
         # Points shared by two images are more informative than keypoints, which replace the missing ones.
         keypoint_rays = 0 if self.keypoints is None else round((1 - cover) * self.keypoint_rays)
         return pixel_rays, new_view_rays, keypoint_rays
-
-    def describe(self, pixel_rays: int) -> str:
-        """The share of each source in a step, with the reason where it is none, in one line."""
-        counts = self.counts(pixel_rays)
-        no_keypoints = "no SfM tracks" if self.keypoints is None else "new views take their place"
-        no_keypoints = no_keypoints if self.keypoint_rays else "--pipeline.datamanager.keypoint-rays 0"
-        reasons = ("", self.no_new_views, no_keypoints)
-        shares = [
-            f"{round(100 * count / sum(counts))} % {name}" + ("" if count else f" ({reason})")
-            for count, name, reason in zip(counts, ("pixels", "new views", "keypoints"), reasons, strict=True)
-        ]
-        return f"Rays of a step: {', '.join(shares)}."
 
     def draw(
         self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False

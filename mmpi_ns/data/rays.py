@@ -121,11 +121,8 @@ def image_rays(camera: Cameras, step: int = 1) -> RayBundle:
 
 @lru_cache(maxsize=2)
 def pixel_directions(camera: tuple[float, ...]) -> Float[Tensor, "P 3"]:
-    """Unit directions of all pixel centres of a camera, in its axes, row after row; the bits of nerfstudio's.
-
-    Args:
-        camera: fx, fy, cx, cy, width, height, camera type (perspective or fisheye), and nerfstudio's distortion
-            parameters.
+    """Unit directions of all pixel centres of a camera, in its axes, row after row; the bits of nerfstudio's. A camera
+    is fx, fy, cx, cy, width, height, type (perspective or fisheye), and nerfstudio's distortion parameters.
 
     Source: ``Cameras._generate_rays_from_coords``, which also makes the two neighbours of every pixel and needs ten
     times as long.

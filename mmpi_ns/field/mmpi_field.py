@@ -31,17 +31,10 @@ from mmpi_ns.scene.geometry import FACING_EPS, LocalRays, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.settings import ColourConfig, Shading
+from mmpi_ns.settings import Shading
 
 POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 2, 2
 """Octaves of the positional encodings of NDC positions, where samples are shaded, and of directions."""
-
-
-def sample_bytes(config: ColourConfig) -> int:
-    """Bytes that the network of one sample stores for its gradients: inputs, layers before and after their activation,
-    and gradients of both. 0 where rays are shaded."""
-    inputs = config.feature_channels + 6 + 6 * (POSITION_FREQUENCIES + DIRECTION_FREQUENCIES)
-    return 4 * (2 * inputs + 6 * config.hidden_width) if config.shading == "sample" else 0
 
 
 class MMPIField(TexelTables):

@@ -60,14 +60,9 @@ def grown_tiles(
     reachable: Bool[Tensor, "T"] | None,
     least: float = 0.0,
 ) -> Int[Tensor, "T"]:
-    """``tiles`` at another resolution, with the tiles that a stored texel of the old one and a training ray reach.
-
-    Args:
-        old: current heads.
-        new: heads at the new resolution; their tiles are not read.
-        reachable: tiles that training rays cross; None for all.
-        least: minimum weight of stored texels in an interpolated one for it to be stored (0: any).
-    """
+    """``tiles`` at another resolution, with the tiles that a stored texel of the old one and a training ray reach
+    (None: all are reachable). Tiles of the ``new`` heads are not read. ``least``: minimum weight of stored texels in an
+    interpolated one for it to be stored (0: any)."""
     stored = torch.zeros_like(new[0].tiles, dtype=torch.bool)
     for source, target in zip(old, new, strict=True):
         for sources, planes in _chunks(target):
@@ -88,13 +83,8 @@ def tiles_with_copies(
     A chosen tile has FINER x FINER tiles in the copy. The MPI drops it if all stored tiles around it are chosen too, so
     copy and MPI overlap by a tile without a visible seam.
 
-    Args:
-        grids: all heads, MPIs first.
-        copies: of the MPIs, at their resolution; their tiles are not read.
-        chosen: stored tiles of MPIs.
-
-    Returns:
-        Tiles of the copies, and of all heads.
+    ``grids`` are all heads, MPIs first; the tiles of ``copies`` are not read. Returns tiles of the copies, and of all
+    heads.
     """
     stored = grids[0].tiles > 0
     fine = stored.new_zeros(len(copies[0].tiles))

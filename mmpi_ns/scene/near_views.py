@@ -23,8 +23,6 @@ def nearest_views(
 
     Args:
         camera_to_worlds: poses, axes in columns, z backwards or forwards. [M, 3, 4]
-        i: the camera.
-        count: maximum number of cameras.
         max_angle: between viewing directions, degrees.
         among: the cameras to choose from; None for all.
         apart: only cameras in another place, whose images have a parallax.

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
+from functools import lru_cache
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
@@ -23,13 +21,9 @@ AT_ONCE = 8
 """Number of cameras that are compared together with the tiles that no earlier one can read."""
 PART = 1 << 14
 """Number of tiles processed together."""
-REMEMBERED = 128
-"""Number of cached results, a bit per tile; the windows of a long capture have a plan each."""
-_remembered: dict[tuple[bytes, ScenePlan], tuple[NDArray[np.uint8], int]] = {}
-"""Cached masks of tiles, eight per byte, and number of tiles, the most recently used last."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrainingViews:
     """Position of each training camera and the four side planes of its frustum."""
 
@@ -61,36 +55,19 @@ class TrainingViews:
         return TrainingViews(poses[:, :, 3], torch.where(bounded[:, None, None], inward, 0.0))
 
 
+@lru_cache(maxsize=16)
 def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.device = "cpu") -> Bool[Tensor, "T"]:
     """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read.
 
     A tile is excluded if it lies outside one of the four side planes of every frustum, or on a plane that no camera is
     in front of. This is conservative: a few too many are marked at the corners of images. All tiles of the cube are
-    marked. Cached for each plan and set of cameras.
-
-    Args:
-        views: the training images.
-        plan: the heads, at the resolution in use.
-        device: where it is computed, in float64.
-
-    Returns:
-        On the CPU.
+    marked. Computed on a device in float64, and returned on the CPU. Cached: the result must not be changed.
     """
-    cameras = hashlib.sha256(views.origins.numpy().tobytes() + views.inward.contiguous().numpy().tobytes())
-    key = cameras.digest(), plan  # on whatever device
-    packed = _remembered.pop(key, None)
-    if packed is None:
-        tiles = [_tiles_of(mpi, views, torch.device(device)).reshape(-1).cpu() for mpi in plan.mpis]
-        if plan.cube is not None:
-            depth, height, width = plan.cube.shape
-            tiles.append(torch.ones(depth * -(-height // SIDE) * -(-width // SIDE), dtype=torch.bool))
-        marks = torch.cat(tiles).numpy()
-        packed = np.packbits(marks), len(marks)
-    _remembered[key] = packed
-    if len(_remembered) > REMEMBERED:
-        del _remembered[next(iter(_remembered))]
-    marks, count = packed
-    return torch.from_numpy(np.unpackbits(marks, count=count).view(bool))
+    tiles = [_tiles_of(mpi, views, torch.device(device)).reshape(-1).cpu() for mpi in plan.mpis]
+    if plan.cube is not None:
+        depth, height, width = plan.cube.shape
+        tiles.append(torch.ones(depth * -(-height // SIDE) * -(-width // SIDE), dtype=torch.bool))
+    return torch.cat(tiles)
 
 
 def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[Tensor, "L Y X"]:

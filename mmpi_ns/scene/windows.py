@@ -88,7 +88,7 @@ class WindowedPlan:
     def from_json(text: str) -> WindowedPlan:
         """Reads what ``to_json`` wrote. Raises InputError with one sentence about what is wrong."""
         data = read_object(text)
-        if "windows" not in data:
+        if not isinstance(data, dict) or "windows" not in data:
             return WindowedPlan.single(ScenePlan.from_object(data))
         rows = data["windows"]
         if set(data) != {"windows"} or not isinstance(rows, list):

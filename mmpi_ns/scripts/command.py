@@ -9,8 +9,6 @@ from typing import Any
 
 import tyro
 
-from mmpi_ns.utils.errors import used_up
-
 
 def print_version(name: str) -> None:
     """Prints the name and the version of pyproject.toml and ends the command if ``--version`` is its first argument."""
@@ -20,18 +18,13 @@ def print_version(name: str) -> None:
 
 
 def run(name: str, command: Any, **how: Any) -> int:
-    """Reads a command's options, runs its ``main`` and returns the exit status.
-
-    Args:
-        name: of the command, for its messages.
-        command: type that tyro builds from the arguments.
-        how: for tyro.
-    """
+    """Reads the options of a command, a type that tyro builds from the arguments, runs its ``main`` and returns the
+    exit status. ``how`` is for tyro."""
     print_version(name)
     try:
         tyro.cli(command, **{"prog": name, **how}).main()
     except (ValueError, OSError) as error:
-        print(f"{name}: {used_up(error) or error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"{name}: Interrupted.", file=sys.stderr)

@@ -6,7 +6,7 @@ import copy
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from mmpi_ns.scene.windows import WindowedPlan
 
 
-Parser = Literal["auto", "nerfstudio", "colmap"]
-
-
 @dataclass
 class PlanCommand:
     """Places MPIs in a scene without training: a table, plan.json, and a picture.
@@ -38,8 +35,6 @@ class PlanCommand:
     """Folder for plan.json, plan.md and plan.png."""
     downscale_factor: int | None = None
     """Size of the images, as for the data parser."""
-    parser: Parser = "auto"
-    """Format of the scene."""
     plan_file: Path | None = None
     """Evaluate this plan instead of making a new one."""
     size: float = 1.0
@@ -60,7 +55,7 @@ class PlanCommand:
         make_writable(self.output, "--output")
         # Before the images are read, so that an error in the plan is reported at once.
         windows = None if self.plan_file is None else WindowedPlan.load(self.plan_file)
-        observations, manager = load_observations(self.scene, self.downscale_factor, self.parser)
+        observations, manager = load_observations(self.scene, self.downscale_factor)
         if windows is None:
             steps = steps_for(most_pixels(observations, self.placement), self.size)
             sized = replace(self.placement, max_texels=self.size * self.placement.max_texels)
@@ -68,45 +63,34 @@ class PlanCommand:
         text = self._explain(windows, observations)
         if manager.priors is not None and manager.priors.movers:
             text += f"\n\n{manager.priors.movers}."
-        title = f"# Plan of {self.scene.resolve().name}"
         plan = self.output / "plan.json"
         write_plan(plan, windows.to_json())
-        write_text(self.output / "plan.md", f"{title}\n\n{text}\n")
+        write_text(self.output / "plan.md", f"# Plan of {self.scene.resolve().name}\n\n{text}\n")
         print(text)
         print(f"\nWrote plan.json, plan.md and plan.png in {self.output}.")
         print(f"Train with it: ns-train mmpi --pipeline.model.plan-file {quoted(plan)} --data ...")
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
         """Draws the plan and returns the tables: for each window, over the observations of its own cameras."""
-        from mmpi_ns.placement.observations import find_visible_points
-        from mmpi_ns.placement.show import draw_plan, explain, table
+        from mmpi_ns.placement.show import draw_plan, table
         from mmpi_ns.placement.split import cameras_of, of_cameras
 
         draw_plan(self.output / "plan.png", windows, observations)
         parts = []
         for i, window in enumerate(windows.windows):
             part = of_cameras(observations, cameras_of(window, observations.centers))
-            report = explain(window.plan, part, find_visible_points(part))
             title = f"## Window {i}: {len(part.centers)} training cameras\n\n" if len(windows) > 1 else ""
             rule = window.plan.origin_of_plan
-            parts.append(f"{title}{table(window.plan, part, report)}\n\n{rule[0].upper()}{rule[1:]}.")
+            parts.append(f"{title}{table(window.plan, part)}\n\n{rule[0].upper()}{rule[1:]}.")
         if len(windows) > 1:
             total = sum(plan.texels for plan in windows.plans) / 1e6
             parts.append(f"{len(windows)} windows, {total:.2f} M texels in all.")
         return "\n\n".join(parts)
 
 
-def load_observations(
-    data: Path, downscale_factor: int | None = None, parser: Parser = "auto"
-) -> tuple[Observations, MMPIDataManager]:
+def load_observations(data: Path, downscale_factor: int | None) -> tuple[Observations, MMPIDataManager]:
     """The observations that training on a scene would use for placement, and the data manager. Raises InputError if the
-    folder holds no scene, or one that cannot be trained.
-
-    Args:
-        data: the scene's folder.
-        downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
-        parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
-    """
+    folder holds no scene, or one that cannot be trained. ``downscale_factor`` is as for the data parser."""
     # Slow imports, which --help does not need.
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
@@ -114,8 +98,7 @@ def load_observations(
     from mmpi_ns.data.checks import colmap_models
 
     config: Any = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
-    is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
-    if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
+    if data.suffix != ".json" and not (data / "transforms.json").is_file():
         models = colmap_models(data)
         if not models:
             raise InputError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")

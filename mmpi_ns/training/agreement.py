@@ -21,13 +21,8 @@ may be kept by one form alone; a wrong kernel differs by more."""
 
 
 def disagreement(field: MMPIField, bundle: RayBundle, options: MarchOptions) -> str:
-    """Description of the differences between compiled operations and plain torch; empty if they agree.
-
-    Args:
-        field: to render.
-        bundle: rays with nears and fars.
-        options: which samples are kept, and how they are blended.
-    """
+    """Description of the differences between compiled operations and plain torch, for rays with nears and fars; empty
+    if they agree."""
     results = {}
     for route in ("auto", "torch"):
         with dispatch.chosen(route), torch.enable_grad():

@@ -1,4 +1,4 @@
-"""Folder of a run: lock, plan and checkpoints, from which only a run of the same capture can resume."""
+"""Folder of a run: plan and checkpoints, from which only a run of the same capture can resume."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor, nn
@@ -27,7 +26,6 @@ from mmpi_ns.utils.pages import all_zero
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "rays", "capture"}
 """Keys of every checkpoint of this method."""
 PLAN_FILE, WINDOWS_FOLDER = "plan.json", "windows"
-_held: dict[Path, FileLock] = {}
 
 
 def checkpoints_in(folder: Path) -> dict[int, Path]:
@@ -37,28 +35,10 @@ def checkpoints_in(folder: Path) -> dict[int, Path]:
 
 
 def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
-    """Locks a run's folder for this process until it ends, and removes files left half-written by killed runs.
-
-    Args:
-        folder: of the run.
-        checkpoints: its folder of checkpoints.
-        resumes_from: folder or file of the checkpoint that the run resumes from.
-
-    Raises:
-        InputError: another run is writing there, or its checkpoints are there and this run does not resume from them.
-        WriteError: the folder cannot be written.
-    """
-    try:
-        with write_errors(folder, "--output-dir"):
-            folder.mkdir(parents=True, exist_ok=True)
-            if folder.resolve() not in _held:  # the system releases it when the process ends, however that happens
-                lock = FileLock(folder.resolve() / ".lock")
-                lock.acquire(timeout=0)
-                _held[folder.resolve()] = lock
-    except Timeout as error:
-        raise InputError(
-            f"Another run is writing into {folder}: wait for its end, or give another --timestamp."
-        ) from error
+    """Makes a run's folder, and removes files left half-written by killed runs. Raises InputError if its folder of
+    ``checkpoints`` holds some and this run does not resume from them, WriteError if it cannot be written."""
+    with write_errors(folder, "--output-dir"):
+        folder.mkdir(parents=True, exist_ok=True)
     source = None if resumes_from is None else resumes_from.resolve()
     resumes = source is not None and checkpoints.resolve() in (source, source.parent)
     if checkpoints_in(checkpoints) and not resumes:

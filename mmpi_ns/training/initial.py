@@ -50,16 +50,8 @@ class Votes(NamedTuple):
         colors: Float[Tensor, "R 3"],
         ray_near: float,
     ) -> None:
-        """Adds the votes of rays, each for the nearest texel on every plane that it intersects.
-
-        Args:
-            layout: MPIs and texels at the resolution in use.
-            origins: of the rays, world axes.
-            directions: unit vectors.
-            depths: inverse distance of a ray's surface, and its expected error.
-            colors: of the surfaces.
-            ray_near: distance at which rays start.
-        """
+        """Adds the votes of rays in world axes, each for the nearest texel on every plane that it intersects.
+        ``depths`` are inverse distances of the surfaces and their expected errors; rays start at ``ray_near``."""
         ends = torch.full_like(origins[:, :1], ray_near), torch.full_like(origins[:, :1], torch.inf)
         hits = plane_hits(origins, directions, *ends, layout.frames)
         for k, (mpi, grid) in enumerate(zip(layout.mpis, layout.grids, strict=False)):
@@ -111,13 +103,7 @@ def start_from_votes(field: MMPIField, votes: Votes) -> None:
 
 
 def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:
-    """Initialises a field from the depth priors of a window's training pixels and new views.
-
-    Args:
-        field: new.
-        sources: of its rays.
-        seed: of the run.
-    """
+    """Initialises a new field from the depth priors of a window's training pixels and new views."""
     sizes = len(field.density), len(field.density), (len(field.density), 3)
     votes = Votes(*(torch.zeros(size, device=field.density.device) for size in sizes))
     for i in range(BATCHES):

@@ -96,12 +96,9 @@ def batch_losses(
     """All losses of a training batch, each times its weight; and the squared colour error of each ray.
 
     Args:
-        rays: rendered ``TrainingRays``: pixel rays, then keypoint rays.
-        field: rendered for these rays.
+        rays: rendered by ``field`` from ``TrainingRays``: pixel rays, then keypoint rays.
         image: [P, 3 or 4] colours of the pixels.
-        weight: of each loss.
         g: draws the colours behind the pixels.
-        step: of the training.
         decay: of the weight of depth priors at this step.
 
     Returns:

@@ -46,7 +46,7 @@ RANGES = {
 
 
 def checked(config: MMPITrainerConfig) -> TrainerConfig:
-    """Checks the options of a run and locks its folder; the settings for its config.yml.
+    """Checks the options of a run and makes its folder; the settings for its config.yml.
 
     They contain absolute paths of the capture and the windows for ns-eval and ns-render, but not the checkpoint that
     this run resumes from, which these must not load.
@@ -77,6 +77,8 @@ def check_run(config: TrainerConfig) -> None:
     check_placement(model.placement, "--pipeline.model.placement.")
     if config.load_step is not None and config.load_dir is None:
         raise InputError("--load-step says nothing without --load-dir: give the folder of the checkpoint too.")
+    if config.steps_per_eval_batch:
+        raise InputError("--steps-per-eval-batch must be 0: --steps-per-eval-image scores whole test images.")
     if config.machine.device_type == "cpu" and (config.mixed_precision or config.use_grad_scaler):
         raise InputError("--mixed-precision and --use-grad-scaler have no effect on a CPU: leave them out.")
     if config.machine.device_type == "cuda" and not torch.cuda.is_available():

@@ -7,7 +7,7 @@ Source: paper sec. III-C ("two-stage reliability learning scheme") and sec. IV (
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import accumulate, pairwise
 
 from mmpi_ns.settings import ScheduleConfig
@@ -125,25 +125,15 @@ class Schedule:
     @staticmethod
     def from_json(text: str) -> Schedule:
         data = json.loads(text)
-        if left := sorted(set(data) - {f.name for f in fields(Schedule)}):
-            raise InputError(f"The run is of an earlier version ({', '.join(left)} of its schedule left): train again.")
         phases = tuple(Phase(**p) for p in data.pop("phases"))
         lists = {name: tuple(data.pop(name, ())) for name in ("growth", "release")}
         return Schedule(phases=phases, **lists, **data)
 
 
 def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, has_depths: bool = False) -> Schedule:
-    """The schedule of a run of ``total_steps`` steps a window.
-
-    Args:
-        config: phases, growth, rates and release of bricks; nothing is released before surfaces have formed.
-        total_steps: all steps of a window.
-        windows: windows of a long capture, trained one after the other.
-        has_depths: training starts with surfaces (``initial.py``).
-
-    Raises:
-        InputError: no step is left for the first phase, growth goes backwards, or rates never fall.
-    """
+    """The schedule of a run of ``total_steps`` steps a window; nothing is released before surfaces have formed.
+    ``has_depths``: training starts with surfaces (``initial.py``). Raises InputError if no step is left for the first
+    phase, growth goes backwards, or rates never fall."""
     if total_steps < 1:
         raise InputError(f"Training needs at least 1 step, got {total_steps}: raise --max-num-iterations.")
     check_schedule(config)

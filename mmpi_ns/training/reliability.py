@@ -47,13 +47,8 @@ def phase_lengths(total_steps: int, blend_share: float, finetune_share: float) -
 
 
 def prepare_parameters(field: MMPIField, groups: Mapping[str, Sequence[Parameter]], phase: str) -> None:
-    """Freezes the parameters that a phase does not train, before each step.
-
-    Args:
-        field: marks the texels that training rays read while MPIs train alone.
-        groups: parameters by kind.
-        phase: by name.
-    """
+    """Freezes the parameters, by kind, that a phase does not train, before each step. While MPIs train alone, the field
+    marks the texels that training rays read."""
     field.marks_texels = phase == "individual"
     for kind, params in groups.items():
         params[0].requires_grad_(kind in TRAINS[phase])
@@ -75,13 +70,8 @@ def assign_heads(
 ) -> tuple[RayBundle, Bool[Tensor, "R H"] | None, Float[Tensor, "R K"] | None]:
     """Rays of a training batch as its phase renders them.
 
-    Args:
-        ray_bundle: of the batch.
-        plan: of the scene, of K MPIs and H heads.
-        phase: by name.
-        rays_per_mpi: while MPIs train alone, each ray is for one of them (split) or for every one in turn (all).
-        draws: generators of the assignment.
-        step: of the training.
+    While the K MPIs, of H heads, train alone, each ray is for one of them (``split``) or for every one in turn
+    (``all``).
 
     Returns:
         The rays, all of them again for every MPI where each renders all; heads that may render each ray, None for all;

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
@@ -17,60 +16,40 @@ from mmpi_ns.rendering.pipeline import MMPIPipeline
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import duration, log, quoted
 
-FIRST_LINE, SHARE = 10, 0.025
-"""Steps before the first progress line, and fraction of all steps between two."""
-LEAST_SECONDS, MOST_SECONDS = 2.0, 30.0
-"""Minimum seconds between two lines."""
+FIRST_LINE, SHARE, LEAST_SECONDS, MOST_SECONDS = 10, 0.025, 2.0, 30.0
+"""The first progress line comes after so many steps; others after a fraction of all steps and at least so many seconds,
+or after at most so many."""
 VIEWS, LOOK_SECONDS = 4, 20.0
 """Quick test: maximum number of test images, and seconds after which no further one is started."""
-EARLY_COST = 2.0
-"""Time of a step before surfaces have formed, relative to a later one: rays have more samples then. 1.5 to 2.4 on
-kitti-street and fox. The predictions stay within a third of what was left."""
 
 
-@dataclass(eq=False)
 class TrainingLog:
-    """Prints the progress of a run."""
+    """Prints the progress of a run from its ``first`` step, with ``rays`` a step after the texels have grown."""
 
-    schedule: Schedule
-    """Of the run."""
-    rays: int
-    """Pixel rays of a step after the texels have grown."""
-    first: int
-    """First step."""
-    end: int
-    """Step after the last one."""
-    _logged_at: float = 0.0
-    """Time of the last line,"""
-    _logged: int = 0
-    """and number of steps at that time."""
-    _phase: str = ""
+    def __init__(self, schedule: Schedule, rays: int, first: int) -> None:
+        self.schedule, self.rays, self.first = schedule, rays, first
+        self._logged = 0
+        """Steps at the time of the last line,"""
+        self._logged_at = 0.0
+        """and that time."""
 
     def note(self, step: int, rgb_loss: Tensor) -> None:
         """Called after each step with its squared colour error; prints if a line is due."""
-        done, now = step + 1, monotonic()
-        if done - self.first == 1:  # the first step includes compilation
-            self._logged_at, self._logged = now, done
-        window, phase = self.schedule.window_at(step), self.schedule.phase_at(step).name
-        where = phase if self.schedule.windows == 1 else f"window {window + 1} of {self.schedule.windows}, {phase}"
-        since, seconds = done - self._logged, now - self._logged_at
-        due = (since >= SHARE * (self.end - self.first) and seconds >= LEAST_SECONDS) or seconds > MOST_SECONDS
-        begins = done - self.first == FIRST_LINE or (where != self._phase and self._phase != "")
-        if since == 0 or done - self.first < FIRST_LINE or not (due or begins or done == self.end):
+        done, now, schedule = step + 1, monotonic(), self.schedule
+        if step == self.first:  # includes compilation
+            self._logged, self._logged_at = done, now
+        since, seconds, end = done - self._logged, now - self._logged_at, schedule.total_steps
+        due = (since >= SHARE * (end - self.first) and seconds >= LEAST_SECONDS) or seconds > MOST_SECONDS
+        if since == 0 or not (due or done == end or done - self.first == FIRST_LINE):
             return
-        each = seconds / since
+        window, phase = schedule.window_at(step), schedule.phase_at(step).name
+        where = phase if schedule.windows == 1 else f"window {window + 1} of {schedule.windows}, {phase}"
         psnr = -10 * math.log10(max(float(rgb_loss.detach()), 1e-12))
         log(
-            f"step {done:,} of {self.end:,} | {where} | {self.rays * since / max(seconds, 1e-9):,.0f} rays/s | "
-            f"batch PSNR {psnr:.1f} dB | {duration(each * self.remaining(step))} left"
+            f"step {done:,} of {end:,} | {where} | {self.rays * since / max(seconds, 1e-9):,.0f} rays/s | "
+            f"batch PSNR {psnr:.1f} dB | {duration(seconds / since * (end - done))} left"
         )
-        self._logged_at, self._logged, self._phase = now, done, where
-
-    def remaining(self, step: int) -> float:
-        """Steps after this one, each counted by its time relative to this step's."""
-        formed = [self.schedule.sharpened(s) for s in range(step, self.end)]
-        rest = sum(1.0 if after else EARLY_COST for after in formed[1:])
-        return rest / (1.0 if formed[0] else EARLY_COST)
+        self._logged, self._logged_at = done, now
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ Also the refined poses, with which the rays of a batch move.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,9 +108,9 @@ class Progress(nn.Module):
 
 
 def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:
-    """Training images of a window."""
-    if views is None:
-        return None
+    """Training images of a window; the same object where they are all."""
+    if views is None or math.isinf(window.radius):
+        return views
     chosen = torch.from_numpy(cameras_of(window, views.origins.numpy()))
     return TrainingViews(views.origins[chosen], views.inward[chosen])
 
@@ -145,12 +146,8 @@ class TrainingRun:
         return groups | ({"camera_opt": self.poses} if self.poses else {})
 
     def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
-        """Applies the schedule of a step: window, resolution, storage and frozen parameters.
-
-        Args:
-            attributes: the trainer's optimisers and data manager; None without a trainer.
-            step: about to run.
-        """
+        """Applies the schedule of a step that is about to run: window, resolution, storage and frozen parameters.
+        ``attributes``: the trainer's optimisers and data manager; None without a trainer."""
         progress, field, schedule = self.progress, self.field, self.progress.schedule
         progress.step = step
         optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}

@@ -15,7 +15,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Int
@@ -45,19 +45,13 @@ SMALL = 1e-4
 """Minimum magnitude in relative comparisons."""
 
 
-class Recording(Protocol):
-    """Recorded operations."""
-
-    def replay(self) -> None: ...
-
-
 class Recorder:
     """Recorder of a function's operations on a GPU, without running them."""
 
     def __init__(self) -> None:
         self.pool = torch.cuda.graph_pool_handle()
 
-    def record(self, run: Callable[[], None], generators: list[torch.Generator]) -> Recording:
+    def record(self, run: Callable[[], None], generators: list[torch.Generator]) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
         for g in generators:
             graph.register_generator_state(g)
@@ -92,22 +86,16 @@ class Results:
 class Recorded:
     """Steps of a kind."""
 
-    gradients: Recording
-    update: Recording
+    gradients: torch.cuda.CUDAGraph
+    update: torch.cuda.CUDAGraph
     results: Results
     learning: list[tuple[TouchedAdam, list[Parameter]]]
     """Parameters whose step the host counts."""
 
 
 class StepGraphs:
-    """Training of a model on a GPU, with graphs once the capacity that steps need is measured.
-
-    Args:
-        model: ``MMPIModel``, to train.
-        manager: its rays.
-        optimizers: by kind of parameter.
-        recorder: of graphs.
-    """
+    """Training of ``MMPIModel`` on a GPU, with graphs once the capacity that steps need is measured; ``optimizers`` are
+    by kind of parameter."""
 
     def __init__(self, model: Any, manager: MMPIDataManager, optimizers: dict[str, Any], recorder: Any = None) -> None:
         self.model, self.manager, self.optimizers = model, manager, optimizers

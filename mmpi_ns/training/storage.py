@@ -35,15 +35,8 @@ MOST_COPIED = 0.1
 def prepare_storage(
     field: TexelTables, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]
 ) -> None:
-    """Grows tables and releases bricks as scheduled for a step.
-
-    Args:
-        field: the field that is trained.
-        schedule: of the whole run.
-        step: that is about to run.
-        least: see ``TexelTables.release_unused``.
-        optimizers: of the tables, by name, if there are any; their moments follow.
-    """
+    """Grows tables and releases bricks (below the weight ``least``) as scheduled for the step that is about to run; the
+    moments of ``optimizers``, by name of the table, follow."""
     trained = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
     phase, factor, remaining = schedule.phase_at(step), schedule.texel_factor(step), []
     grows = factor > field.factor

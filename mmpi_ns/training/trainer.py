@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
 from functools import partial
 from time import monotonic
 from typing import Any, Literal, NoReturn, cast
@@ -12,7 +11,6 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
-from nerfstudio.viewer.viewer import Viewer
 from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.data.datamanager import MMPIDataManager
@@ -38,10 +36,9 @@ from mmpi_ns.training.checkpoints import (
     read_checkpoint,
     states_of,
 )
-from mmpi_ns.training.frames import FrameTurns
 from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.report import TrainingLog, next_commands, quick_test
-from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
+from mmpi_ns.training.run import TrainingRun, views_of
 from mmpi_ns.training.step_graph import StepGraphs
 from mmpi_ns.utils.errors import InputError, duration, log, quoted
 from mmpi_ns.utils.files import write_atomically, write_plan
@@ -64,7 +61,6 @@ class MMPITrainer(Trainer):
         with signals_go_to(_end), one_thread_each():
             if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
                 torch.cuda.set_device(self.local_rank)
-            self.turns = FrameTurns(lambda: self.training_state == "training")
             self._stopped_by: int | None = None
             self._compared = False
             self._log: TrainingLog | None = None
@@ -115,9 +111,7 @@ class MMPITrainer(Trainer):
         """Prints capture, plan, memory and expected time together, before the first step."""
         run, manager, windows = self._run, self._manager, plan.windows
         work = Work(run.field.feature_channels, not run.progress.schedule.is_joint)
-        cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
-        tables = (training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows)
-        held = [each + manager.pixel_bytes(c) for each, c in zip(tables, cameras, strict=True)]
+        held = max(training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows)
         log(manager.describe())
         log(describe(plan, self._window_steps, held))
         if self._follows_capture:
@@ -153,24 +147,17 @@ class MMPITrainer(Trainer):
     def train(self) -> None:
         """Runs max-num-iterations in total (a window); nerfstudio 1.1.5 would run as many again after a resume."""
         if self._start_step >= self._total_steps:
-            # A finished run lacks its details if it was interrupted.
+            log(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps.")
             self._last_step = self._start_step - 1
-            shows_details = cast(Any, self.pipeline.model).config.rendering.nearest_images
-            is_last = self._start_step == self._total_steps
-            lacks = is_last and shows_details and self._last_step in checkpoints_in(self.checkpoint_dir)
-            with suppress(InputError):  # damaged ones are made again
-                lacks = lacks and details_of(self.base_dir / DETAILS_FOLDER, self._last_step) is None
-            left = "details of its training images are made" if lacks else "nothing to do"
-            log(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: {left}.")
-            if lacks:
-                self._complete()
+            self.save_checkpoint(self._last_step)
+            self._complete()  # an interrupted run lacks its details
             return
 
         def stop(number: int) -> None:  # nerfstudio's loop ends after the current step, even if training is paused
             self._stopped_by, self.stop_training = number, True
 
         with signals_go_to(stop):
-            self._train_until(self._total_steps)
+            self._train()
         if self._stopped_by is not None:
             self.config.logging.profiler = "none"  # no further output
             path = checkpoints_in(self.checkpoint_dir).get(self._last_step)
@@ -182,13 +169,12 @@ class MMPITrainer(Trainer):
                 f"command with --load-dir {quoted(self.checkpoint_dir)} continues from there.",
             )
 
-    def _train_until(self, end: int) -> None:
-        """Trains from the first step to that before ``end``."""
+    def _train(self) -> None:
         self._last_step = self._start_step - 1
-        self.config.max_num_iterations = max(0, end - self._start_step)
-        rays = self._manager.get_train_rays_per_batch()
-        schedule = self._run.progress.schedule
-        self._log = TrainingLog(schedule, rays, self._start_step, end) if self._logs_lines else None
+        self.config.max_num_iterations = self._total_steps - self._start_step
+        if self._logs_lines:
+            rays, schedule = self._manager.get_train_rays_per_batch(), self._run.progress.schedule
+            self._log = TrainingLog(schedule, rays, self._start_step)
         try:
             with torch_apart(), keep_freed_memory():
                 super().train()
@@ -233,12 +219,6 @@ class MMPITrainer(Trainer):
         for values in others:
             values.update({name: v.detach() for name, v in values.items() if isinstance(v, torch.Tensor)})
         return loss.detach(), *others
-
-    def _update_viewer_state(self, step: int) -> None:
-        if isinstance(self.viewer_state, Viewer):
-            self.turns.after_step(self.viewer_state, step)
-        else:
-            super()._update_viewer_state(step)
 
     def _after_train(self) -> None:
         """Saves with the number of the last step that ran; nerfstudio 1.1.5 would use the next one after a stop."""

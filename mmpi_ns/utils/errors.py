@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import re
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,11 +10,6 @@ from pathlib import Path
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a full disk, or of a user's share of it."""
-NO_MEMORY = "can't allocate memory|out of memory|Insufficient memory|can't start new thread|bad_alloc"
-"""Messages of torch, CUDA, OpenCV, Python and C++ for lack of memory or threads."""
-
 
 class InputError(ValueError):
     """Unusable input. The message is one sentence: what is wrong, where, and what to do."""
@@ -25,26 +17,6 @@ class InputError(ValueError):
 
 class WriteError(InputError, OSError):
     """Failure to write a file or folder; one sentence as well."""
-
-
-def used_up(error: BaseException) -> str | None:
-    """A sentence for an error of a full disk or exhausted memory, of the computer or a GPU; None for any other error,
-    and if it is a sentence already."""
-    if isinstance(error, InputError):
-        return None
-    number = getattr(error, "errno", None)
-    if number in FULL or os.strerror(errno.ENOSPC) in str(error):  # as ffmpeg says it
-        name = getattr(error, "filename", None)
-        what = f"{name} could not be written" if name else "A file could not be written"
-        why = os.strerror(number or errno.ENOSPC)
-        return f"{what} ({why}): finished files are untouched, so make room and start again."
-    if isinstance(error, MemoryError) or number == errno.ENOMEM or re.search(NO_MEMORY, str(error)):
-        what = brief(error) or type(error).__name__
-        return (
-            f"Memory is used up ({what}): finished files are untouched, so end other programs or give less, and "
-            "start again."
-        )
-    return None
 
 
 def brief(error: BaseException) -> str:

@@ -89,8 +89,6 @@ def write_errors(folder: Path, option: str) -> Iterator[None]:
     """Errors of writing in a folder, within the block: WriteError with the option that names another folder."""
     try:
         yield
-    except TimeoutError:  # of a lock that another process holds
-        raise
     except OSError as error:
         raise WriteError(f"{folder} cannot be written ({brief(error)}): choose another {option}.") from error
 

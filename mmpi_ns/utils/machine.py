@@ -28,13 +28,6 @@ def free_memory(device: str | torch.device) -> int:
         left.append(int((CGROUP / "memory.max").read_text()) - int((CGROUP / "memory.current").read_text()))
     except (OSError, ValueError):  # no container, or one without a limit
         pass
-    if sys.platform == "linux":
-        import resource
-
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit != resource.RLIM_INFINITY:
-            used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-            left.append(limit - used)
     return max(0, min(left))
 
 

@@ -11,12 +11,11 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
-from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
+from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, in_capture_frame
 
 from mmpi_ns.data import rays
 from mmpi_ns.data.rays import CameraRays, image_rays
-from mmpi_ns.utils.errors import InputError
 from mmpi_priors.sfm import MIN_TRACK
 
 TRACKED = sum(project(i, wall_points())[1].astype(int) for i in range(8)) >= MIN_TRACK
@@ -89,15 +88,6 @@ def test_masks_that_leave_nothing_are_refused(tmp_path):
         Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(data / "masks" / name_of(i))
     with pytest.raises(ValueError, match="masks leave no training pixel"):
         datamanager(data)
-
-
-def test_a_mask_over_all_of_a_test_image_is_named(tmp_path):
-    scene = write_scene(tmp_path / "scene", masks=True)
-    for i in TEST:
-        Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(scene / "masks" / name_of(i))
-    manager = datamanager(scene)
-    with pytest.raises(InputError, match=r"The mask of .* leaves no pixel: correct it\."):
-        manager.next_eval(0)
 
 
 def test_transparency_reaches_the_batch(tmp_path):

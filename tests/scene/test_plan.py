@@ -65,7 +65,7 @@ def test_heads_are_the_mpis_and_then_the_cube(plan):
         ({"axes": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 2.0))}, "axes"),
         ({"axes": ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))}, "axes"),  # left-handed
         ({"planes": 1}, "planes"),
-        ({"height": 1}, "texels"),
+        ({"height": 1}, "height"),
         ({"far": 1.0}, "far"),
         ({"far": math.nan}, "far"),
     ],
