@@ -57,8 +57,8 @@ class PlacementConfig:
     texel_pixels: float = 1.5
     """Image pixels that a texel spans, seen from the origin of the MPI (automatic)."""
     rays_per_texel: float = 5.0
-    """Minimum number of training rays through a texel, from all images that see it, of which the first 0.55 of each
-    pixel count: short runs on large images, and images with little overlap, get larger texels (automatic)."""
+    """Minimum number of training rays through a texel, from all images that see it: short runs on large images with
+    little overlap get larger texels (automatic)."""
     height: int = 96
     """Texel rows of every MPI (drive, room)."""
     width: int = 256

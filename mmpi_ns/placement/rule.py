@@ -35,9 +35,6 @@ ENOUGH = 0.85
 """Expected error, relative to a texel's pixels, below which no further MPI is needed."""
 TEXELS_PER_RAY = 8.0
 """Maximum texels for each training ray, in total: more would overfit."""
-MOST_RAYS = 0.55
-"""Rays per training pixel above which texels get no finer, however long the training: where few images see a surface,
-finer texels fit each image alone, and new views get worse."""
 DRIVE_PULL_BACK = 0.45
 """Distance of the front MPI of a drive behind the first camera, as a fraction of the travel."""
 OVERLAPPING = 1.25
@@ -79,11 +76,8 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     elif texel_pixels > finest:  # there are rays for finer texels, and released ones leave room
         detail = min((texel_pixels / finest) ** 2, MOST_DETAIL)
         remedy = f"a larger placement.max-texels, or down to {finest:.1f} in training in the room of released ones"
-    elif trainable > config.texel_pixels:
-        is_short = (training_rays or 0) < MOST_RAYS * observations.sizes.prod(-1).sum()
-        remedy = "more steps" if is_short else "more images of the same surfaces, or a smaller placement.rays-per-texel"
     else:
-        remedy = "a smaller placement.texel-pixels"
+        remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
     mpis = tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(chosen))  # two may be placed at one camera
     return ScenePlan(mpis, None, 0.2 * visible.near, visible.near, origin, detail)
@@ -111,7 +105,7 @@ def texel_limits(
     budget = min((limit for limit in limits if limit > 0), default=0.0)
     if training_rays is None:
         return 0.0, budget
-    rays_per_pixel = min(training_rays / float(observations.sizes.prod(-1).sum()), MOST_RAYS)
+    rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
     return (config.rays_per_texel / (rays_per_pixel * pixels_per_pixel(observations, visible))) ** 0.5, budget
 
 

@@ -100,16 +100,6 @@ def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
     assert f"a texel spans {spans:.1f} pixels: finer with more steps" in short.origin_of_plan
 
 
-def test_longer_runs_get_no_finer_texels_than_the_overlap_of_the_images_supports():
-    lone = street(count=1)
-    pixels, config = int(lone.sizes.prod(-1).sum()), PlacementConfig(max_texels=0)
-    assert pixels_per_pixel(lone, find_visible_points(lone)) == 1.0
-    once, often = (place(lone, config, n * pixels) for n in (1, 100))
-    assert once == often and "finer with more images of the same surfaces" in once.origin_of_plan
-    assert "a texel spans 3.0 pixels" in once.origin_of_plan
-    assert "a texel spans 1.5 pixels" in place(lone, replace(config, rays_per_texel=0), 100 * pixels).origin_of_plan
-
-
 def test_points_that_are_not_finite_or_behind_their_camera_are_left_out():
     observations = street()
     points = observations.points.copy()
