@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from random_scenes import CUBE, Scene, dense_grad, gradients_of, of_slots, rando
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch, interpolate, variation
-from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.training.touched_adam import TouchedAdam
 
@@ -162,26 +160,6 @@ def variations(device: str, texels: int) -> list[Check]:
     return _twice({"total variation": 1e-5, "total variation: gradient": 1e-5}, work)
 
 
-def compositing_kernels(device: str, rays: int, slots: int) -> list[Check]:
-    """Thin, ordinary and opaque samples, and rays without any."""
-    g = torch.Generator().manual_seed(3)
-    tau = (10 ** (torch.rand(rays, slots, generator=g) * 6 - 5)).to(device)
-    valid = (torch.arange(slots) < torch.randint(0, slots + 1, (rays, 1), generator=g)).to(device)
-    before = (torch.rand(rays, slots, generator=g).cumsum(1) * 0.02).to(device)
-    upstream = _draw(device, rays, slots)
-
-    def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
-        leaf = tau.to(dtype, copy=True).requires_grad_()
-        composite = composite_weights(leaf, valid, before.to(dtype), before[:, -1:].to(dtype))
-        ((composite.weights * upstream).sum() + composite.accumulation.sum()).backward()
-        assert leaf.grad is not None
-        return composite.weights, composite.transmittance, leaf.grad
-
-    return _twice(
-        {f"compositing {slots} samples: {name}": 5e-6 for name in ("weights", "transmittance", "gradient")}, work
-    )
-
-
 def adam(device: str, rows: int) -> list[Check]:
     """Four steps on touched rows, with moments in bfloat16 too, whose roundings these four steps keep small."""
 
@@ -212,7 +190,6 @@ def run_checks(device: str, rehearse: bool) -> dict[str, Any]:
     groups: list[Callable[[], list[Check]]] = [  # at the sizes of a training step, or small
         lambda: interpolation(device, size),
         lambda: distinct_rows(device, size),
-        *(partial(compositing_kernels, device, 20 if rehearse else 4096, slots) for slots in (16, 37, 64, 300, 1000)),
         lambda: variations(device, 200 if rehearse else 100_000),
         lambda: adam(device, size),
         lambda: marches(device, rehearse),

@@ -171,10 +171,10 @@ def _shading(field: Any, rays: Any, samples: MergedSamples, lookup: Lookup) -> l
     valid, skipped = samples.valid, (samples.skipped_before, samples.skipped_total)
     tau, features = samples.tau.clone().requires_grad_(), lookup.features.detach().requires_grad_()
     lookup = replace(lookup, density=lookup.density.detach(), features=features)
-    fixed = composite_weights.reference(tau.detach(), valid, *skipped)
+    fixed = composite_weights(tau.detach(), valid, *skipped)
 
     def weigh() -> Tensor:
-        return composite_weights.reference(tau, valid, *skipped).weights
+        return composite_weights(tau, valid, *skipped).weights
 
     def show() -> Tensor:
         return field.render_colors(rays, samples, lookup, fixed)[0]

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops import depth_sums as depth_sums
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops import variation as variation
 from mmpi_ns.ops.adam import AdamConstants
@@ -137,31 +136,6 @@ def _gathers(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
-def _rays(device: str, slots: int) -> tuple[Tensor, Tensor]:
-    """Positive numbers in the slots of rays, and which of these hold a sample."""
-    return _random(device, RAYS, slots), torch.arange(slots, device=device) < torch.arange(RAYS, device=device)[:, None]
-
-
-def _composites(device: str, shapes: Shapes) -> list[tuple]:
-    cases = []
-    for slots in (1, 31, 130):
-        tau, valid = _rays(device, slots)
-        before, total = _random(device, RAYS, slots + 1)[:, 1:].contiguous(), _random(device, RAYS, 1)
-        cases.append((tau.requires_grad_(), valid, before, total))
-    return cases
-
-
-def _depths(device: str, shapes: Shapes) -> list[tuple]:
-    cases = []
-    for slots in (1, 31, 130):
-        inverse_t, valid = _rays(device, slots)
-        weights = torch.where(valid, _random(device, RAYS, slots + 1)[:, 1:] / slots, 0.0).requires_grad_()
-        inverse_t = torch.where(valid, inverse_t, 0.0).sort(-1, descending=True).values
-        targets = _random(device, RAYS, 2) + 0.1
-        cases.append((weights, inverse_t, valid, _random(device, RAYS), targets, 0.7))
-    return cases
-
-
 def _updates(device: str, shapes: Shapes) -> list[tuple]:
     rows = torch.arange(BRICK, BRICK + 2 * ROWS, 2, device=device)
     cases = []
@@ -175,8 +149,6 @@ def _updates(device: str, shapes: Shapes) -> list[tuple]:
 CHANGED = {"adam_rows": (0, 1)}
 """Arguments that an operation changes."""
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
-    "composite_weights": _composites,
-    "depth_sums": _depths,
     "adam_rows": _updates,
     "march": _marches,
     "total_variation": _variations,

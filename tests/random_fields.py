@@ -79,7 +79,7 @@ def render(field, rays, threshold=0.0, blends=False, **chosen):
     if blends and lookup.index.numel():
         flat = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(rays, samples, lookup))
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
-    composite = composite_weights.reference(tau, samples.valid, samples.skipped_before, samples.skipped_total)
+    composite = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
     return Rendered(samples, composite, render_colors(composite, field.sample_colors(rays, samples, lookup)))
 
 

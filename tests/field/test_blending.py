@@ -23,7 +23,7 @@ def shares_of(votes, dtype=F64):
 
 def composite_all(tau):
     nothing, everything = torch.zeros_like(tau), torch.ones_like(tau, dtype=torch.bool)
-    return composite_weights.reference(tau, everything, nothing, nothing[:, :1])
+    return composite_weights(tau, everything, nothing, nothing[:, :1])
 
 
 # Shares --------------------------------------------------------------------------------------------------------------

@@ -1,5 +1,4 @@
-"""Merged transmittance, sample by sample, and what a ray gathers; the compiled form against float64, also on hard rays
-(ops/composite)."""
+"""Merged transmittance, sample by sample, and what a ray gathers, also on hard rays (ops/composite)."""
 
 from __future__ import annotations
 
@@ -9,7 +8,6 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from compiled import compiled  # noqa: F401
 from hand_made import tensor
 
 from mmpi_ns.ops.composite import (
@@ -30,7 +28,7 @@ def test_exclusive_cumsum_sums_what_came_before():
 def test_weights_of_a_hand_computed_ray():
     tau = tensor([[math.log(2), math.log(4), 0.0, math.log(2)]])  # alpha 1/2, 3/4, 0, 1/2
     nothing, everything = torch.zeros_like(tau), torch.ones_like(tau, dtype=torch.bool)
-    composite = composite_weights.reference(tau, everything, nothing, nothing[:, :1])
+    composite = composite_weights(tau, everything, nothing, nothing[:, :1])
     assert composite.weights[0].tolist() == pytest.approx([1 / 2, 3 / 8, 0, 1 / 16])
     assert composite.transmittance.item() == pytest.approx(1 / 16)
     assert composite.accumulation.item() == pytest.approx(15 / 16)
@@ -39,7 +37,7 @@ def test_weights_of_a_hand_computed_ray():
 def test_dropped_mass_takes_the_mean_colour_of_what_was_kept():
     tau = tensor([[0.2, 0.4]])
     valid = torch.ones(1, 2, dtype=torch.bool)
-    composite = composite_weights.reference(tau, valid, torch.zeros_like(tau), tensor([[0.5]]))
+    composite = composite_weights(tau, valid, torch.zeros_like(tau), tensor([[0.5]]))
     colors = tensor([[[1.0, 0.0, 0.2], [0.0, 1.0, 0.2]]])
     w = oracle.composite([0.2, 0.4]).weights
     expected = (1 - math.exp(-1.1)) * np.array([w[0], w[1], 0.2 * w.sum()]) / w.sum()
@@ -61,9 +59,6 @@ def test_median_distance_is_where_half_of_the_gathered_weight_is_reached():
     assert median[:, 0].tolist() == [2.0, 3.0, 0.0, 2.0, 0.0]
 
 
-# Compiled -------------------------------------------------------------------------------------------------------------
-
-
 def batch(rays=60, slots=37):
     """Optical depths from 1e-7 to 1e3, some exactly 0, in rays of 0 to all slots, with dropped samples between them."""
     g = torch.Generator().manual_seed(rays)
@@ -76,10 +71,10 @@ def batch(rays=60, slots=37):
     return tau, valid, skipped, skipped[:, -1:] + 0.02
 
 
-def weights_and_gradient(function, given, dtype):
+def weights_and_gradient(given, dtype):
     tau, valid, before, total = given
     tau = tau.detach().to(dtype).requires_grad_()
-    made = function(tau, valid, before.to(dtype), total.to(dtype))
+    made = composite_weights(tau, valid, before.to(dtype), total.to(dtype))
     g = torch.Generator().manual_seed(1)
     parts = (made.weights, made.accumulation, made.transmittance)
     sum((p * torch.randn(p.shape, generator=g)).sum() for p in parts).backward()
@@ -89,8 +84,8 @@ def weights_and_gradient(function, given, dtype):
 @pytest.mark.parametrize("slots", [1, 16, 37])
 def test_weights_and_their_gradient_equal_float64(slots):
     given = batch(slots=slots)
-    actual = weights_and_gradient(composite_weights, given, torch.float32)
-    wanted = weights_and_gradient(composite_weights.reference, given, torch.float64)
+    actual = weights_and_gradient(given, torch.float32)
+    wanted = weights_and_gradient(given, torch.float64)
     for a, b in zip(actual, wanted, strict=True):
         assert ((a.double() - b).abs() <= 3e-6 * (1 + b.abs().amax(-1, keepdim=True))).all()
     assert (actual[0][~given[1]] == 0).all() and (actual[3][~given[1]] == 0).all()
@@ -120,7 +115,7 @@ def test_colours_of_rays_and_their_gradients_equal_float64():
     colors, upstream = torch.rand(60, 37, 3, generator=g), torch.randn(60, 3, generator=g)
     actual = []
     for dtype in (torch.float32, torch.float64):
-        made = composite_weights.reference(*(x.to(dtype) if x.is_floating_point() else x for x in given))
+        made = composite_weights(*(x.to(dtype) if x.is_floating_point() else x for x in given))
         weights, own = made.weights.requires_grad_(), colors.detach().to(dtype).requires_grad_()
         rgb = render_colors(Composite(weights, made.accumulation, made.transmittance), own)
         (rgb * upstream).sum().backward()

@@ -24,11 +24,8 @@ from stability.cases import (
 
 from mmpi_ns.blending import blend_shares, blended_optical_depth
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops import composite
-from mmpi_ns.ops.composite import median_inverse_distance, render_colors
+from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, render_colors
 from mmpi_ns.scene.plan import ScenePlan
-
-composite_weights = composite.composite_weights.reference
 
 TAUS = (0.0, 1e-30, 1e-12, 1e-6, 1e-3, 0.1, 1.0, 5.0, 30.0, 90.0, 1e4)
 LONG = 10_000

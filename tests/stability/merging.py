@@ -138,7 +138,7 @@ def _distortion(weights: Array, positions: Array, precision: Precision) -> Outco
     others = float32(inverse_t), everywhere, torch.full((rays,), 1 / count), nothing, 1.0
 
     def distortion(x: torch.Tensor) -> torch.Tensor:
-        return depth_sums.reference(x, *others).spread.mean()
+        return depth_sums(x, *others).spread.mean()
 
     wanted = value, (slope / rays).astype(np.float64), (size / rays).astype(np.float64)
     total = float(2 * (w.sum(-1) ** 2).mean()) + 1e-30
@@ -175,7 +175,7 @@ def _keypoint(precision: Precision) -> Outcome:
     there = float32(q), torch.ones(6, 9, dtype=torch.bool), torch.zeros(6), targets, 1.0
 
     def keypoint(v: torch.Tensor) -> torch.Tensor:
-        _, mass, reached = depth_sums.reference(v, *there)
+        _, mass, reached = depth_sums(v, *there)
         return losses.depth_priors(mass, reached, losses.KEYPOINT_OUTLIERS, reached.sum().clamp(min=1))
 
     return _loss(precision, keypoint, w, wanted, 60.0, 16)

@@ -6,22 +6,13 @@ infinite, while tau is an ordinary number. All arithmetic is float32 or wider, a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.build import call_in_parts
-from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import HALF
-from mmpi_ns.ops.layout import dense
-
-Run = Callable[..., None]
-"""Compiled code for all rays: takes R, S, numbers, inputs and outputs."""
 
 
 def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
@@ -42,7 +33,6 @@ class Composite:
     """Behind the last sample."""
 
 
-@operation("gpu")
 def composite_weights(
     tau: Float[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
@@ -62,45 +52,11 @@ def composite_weights(
 
     Source: paper eq. (rendering) and its blended form in sec. III-C.
     """
-    tau = torch.where(valid, tau, torch.zeros_like(tau))
-    log_transmittance = -(exclusive_cumsum(tau) + skipped_before)
-    weights = torch.exp(log_transmittance) * -torch.expm1(-tau)
-    weights = torch.where(valid, weights, torch.zeros_like(weights))
+    tau = torch.where(valid, tau, 0.0)
+    through = -tau
+    weights = -(torch.exp(exclusive_cumsum(through) - skipped_before) * torch.expm1(through))
     depth = tau.sum(-1, keepdim=True) + skipped_total
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
-
-
-class _Composite(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, run: Run, back: Run, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        weights, depth = torch.empty_like(tau), torch.empty_like(total)
-        run(*tau.shape, tau, valid, before, total, weights, depth)
-        ctx.save_for_backward(tau, valid, before, weights)
-        ctx.back = back
-        return weights, depth
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        tau, *_ = saved = ctx.saved_tensors
-        grad = torch.empty_like(tau)
-        ctx.back(*tau.shape, *saved, *(g.contiguous() for g in grad_outputs), grad)
-        return None, None, grad, None, None, None
-
-
-def compiled_weights(
-    run: Run, back: Run, tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor
-) -> Composite:
-    """``composite_weights`` by compiled code, which takes sizes, inputs and outputs."""
-    tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(skipped_before, skipped_total))
-    weights, depth = _Composite.apply(run, back, *tensors)  # type: ignore[misc]
-    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
-
-
-composite_weights.on_cpu(
-    partial(compiled_weights, *(partial(call_in_parts, name) for name in ("mmpi_composite", "mmpi_composite_back")))
-)
 
 
 def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
