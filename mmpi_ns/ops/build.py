@@ -11,7 +11,6 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -33,8 +32,6 @@ FORMS = {int: ctypes.c_int64, bool: ctypes.c_bool, float: ctypes.c_float}
 """C types of Python numbers."""
 ENTRIES_PER_PART = 1024
 """Entries sampled to divide sums evenly among threads."""
-MOST_PARTS = (1 << 16) - 1
-"""Suffix of functions that other threads run later (``cpp/parts.h``)."""
 
 
 class CannotCompile(Exception):
@@ -144,32 +141,6 @@ def call_in_parts(name: str, parts: int | Sequence[int], *values: Any, least: in
     bounds = even_bounds(parts, least) if isinstance(parts, int) else parts
     how = (ctypes.c_int64 * len(bounds))(*bounds), ctypes.c_int64(len(bounds) - 1)
     _function(f"{name}_in_parts", folder)(*how, *arguments(values))
-
-
-class Pending:
-    """A compiled function that idle threads work on."""
-
-    def __init__(self, name: str, number: int, values: Sequence[Any]) -> None:
-        self._values = values  # kept alive
-        self.finish = functools.partial(_function(f"{name}_finish"), ctypes.c_int64(number))
-        """Returns when the function has written all of its results."""
-        weakref.finalize(self, self.finish)  # before the values go, at the latest at the end of the process
-
-
-def leave_in_parts(name: str, count: int, size: int, *values: Any) -> Pending | None:
-    """A compiled function of ``(begin, end, *values)`` for 0 to ``count``, to be called by other threads for ``size``
-    numbers at a time. None if there are too few numbers or no other threads: nothing is called then.
-
-    Args:
-        name: of the function, which has LATER_IN_PARTS in ``cpp/parts.h``.
-        count: of the numbers.
-        size: of a part, at least: an operation that is waited for may wait for one of them.
-        values: further arguments (``arguments``).
-    """
-    helpers, size = num_threads() - 1, max(size, -(-count // MOST_PARTS))
-    if helpers < 1 or count <= helpers * size:
-        return None
-    return Pending(name, _function(f"{name}_later")(*arguments((count, size, helpers, *values))), values)
 
 
 @functools.cache

@@ -78,7 +78,7 @@ class TouchedAdam(torch.optim.Optimizer):
                 old, constants = (param.data, self.state[param]["moments"]), self._constants[param]
                 if isinstance(param, Table):
                     assert param.grad_rows is not None
-                    param.pending = adam_rows(*old, param.grad_rows, param.grad, constants)
+                    adam_rows(*old, param.grad_rows, param.grad, constants)
                 else:
                     for tensor, new in zip(old, adam(*old, param.grad, constants), strict=True):
                         tensor.copy_(new)
@@ -87,20 +87,7 @@ class TouchedAdam(torch.optim.Optimizer):
         """Keeps the moments of the bricks ``kept`` [K] of a table, in ascending order."""
         state = self.state.get(param, {})
         if "moments" in state:
-            self.settle()
             state["moments"] = move_bricks(state["moments"], kept)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The state, once the last step is finished."""
-        self.settle()
-        return super().state_dict()
-
-    def settle(self) -> None:
-        """Returns when the last step is finished, which may have been left to other threads."""
-        for group in self.param_groups:
-            for param in group["params"]:
-                if isinstance(param, Table):
-                    param.settle()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads the state without torch's conversion of moments to the precision of their parameters."""

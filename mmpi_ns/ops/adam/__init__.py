@@ -8,14 +8,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.build import Pending, call_in_parts, leave_in_parts
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.scene.texels import BRICK
 
 AT_LEAST = 4096
 """Rows that justify another thread."""
-AT_ONCE = 1024
-"""Rows of a part that other threads update later; an operation may have to wait for one part, some 0.05 ms."""
 
 
 class AdamConstants(NamedTuple):
@@ -38,7 +36,7 @@ def adam_rows(
     rows: Int[Tensor, "U"],
     grad: Float[Tensor, "U C"],
     constants: AdamConstants,
-) -> Pending | None:
+) -> None:
     """One step of Adam on distinct rows. The empty brick and entries whose gradient is exactly 0 do not change.
 
     Args:
@@ -47,15 +45,11 @@ def adam_rows(
         rows: of the gradient (``Table.grad_rows``).
         grad: of those rows.
         constants: of the step.
-
-    Returns:
-        The pending part of the step, to be finished before ``param`` and ``moments`` are read; None if there is none.
     """
     grad = grad.masked_fill((rows < BRICK)[:, None], 0)
     new_param, new_moments = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)
     param.index_copy_(0, rows, new_param)
     moments.index_copy_(0, rows, new_moments)
-    return None
 
 
 def adam(
@@ -75,13 +69,9 @@ def adam(
 
 
 @adam_rows.on_cpu
-def adam_rows_on_cpu(
-    param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: AdamConstants
-) -> Pending | None:
+def adam_rows_on_cpu(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: AdamConstants) -> None:
     if not param.is_contiguous() or moments.dtype != torch.bfloat16:
-        return adam_rows.reference(param, moments, rows, grad, constants)
+        adam_rows.reference(param, moments, rows, grad, constants)
+        return
     step = (rows.contiguous(), param.shape[1], grad.contiguous(), param, moments, *map(float, constants))
-    pending = leave_in_parts("mmpi_adam_rows", len(rows), AT_ONCE, *step)
-    if pending is None:
-        call_in_parts("mmpi_adam_rows", len(rows), *step, least=AT_LEAST)
-    return pending
+    call_in_parts("mmpi_adam_rows", len(rows), *step, least=AT_LEAST)

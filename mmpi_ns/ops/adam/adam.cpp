@@ -56,4 +56,3 @@ void mmpi_adam_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t cha
 } // namespace
 
 IN_PARTS(mmpi_adam_rows)
-LATER_IN_PARTS(mmpi_adam_rows)

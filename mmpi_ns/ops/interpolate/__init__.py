@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor, nn
 
-from mmpi_ns.ops.build import Pending, call_in_parts, even_bounds, owned_bounds
+from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
@@ -39,38 +39,11 @@ class Table(nn.Parameter):
 
     ``read_rows`` adds to the gradient and ``TouchedAdam`` uses it. Elementwise treatment of gradients works as with any
     parameter: dropping, scaling, clipping and norms, in torch and in nerfstudio.
-
-    Other threads may run the optimiser's step. ``data``, ``detach`` and ``read_rows`` wait for it; other operations on
-    the parameter itself do not.
     """
 
     grad_rows: Int[Tensor, "U"] | None = None
     """Ascending and distinct, but row 0 with a gradient of 0 may follow any number of times."""
     _row_grad: Float[Tensor, "U C"] | None = None
-    pending: Pending | None = None
-    """Pending step of the optimiser in other threads."""
-
-    def settle(self) -> None:
-        """Waits for the pending step of the optimiser."""
-        if self.pending is not None:
-            self.pending.finish()
-            self.pending = None
-
-    @property
-    def data(self) -> Float[Tensor, "T C"]:  # type: ignore[override]
-        """The values, without gradients."""
-        self.settle()
-        return super().data
-
-    @data.setter
-    def data(self, values: Float[Tensor, "T C"]) -> None:
-        self.settle()
-        Tensor.data.__set__(self, values)  # type: ignore[attr-defined]
-
-    def detach(self) -> Float[Tensor, "T C"]:
-        """The values, without gradients."""
-        self.settle()
-        return super().detach()
 
     @property
     def grad(self) -> Float[Tensor, "U C"] | None:  # type: ignore[override]
@@ -190,12 +163,6 @@ def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]
 
 
-@operation(in_cpp=AT_LEAST)
-def take_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
-    """Values of ``read_rows``."""
-    return table.index_select(0, rows)
-
-
 def weigh_rows(
     values: Float[Tensor, "U C"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
@@ -234,7 +201,7 @@ class _ReadRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Table, rows: Tensor) -> Tensor:
         ctx.table, ctx.rows = table, rows
-        return take_rows(table.data, rows)
+        return table.data.index_select(0, rows)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[None, None]:

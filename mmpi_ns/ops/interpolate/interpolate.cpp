@@ -43,17 +43,6 @@ void mmpi_place_rows(int64_t begin, int64_t end, const int64_t* rows, const uint
     }
 }
 
-// Rows [begin, end) of a list, read from the table; consecutive ones in one copy.
-void mmpi_take_rows(int64_t begin, int64_t end, const float* table, const int64_t* rows, int64_t, int64_t channels,
-                    int64_t, float* values) {
-    for (int64_t i = begin, next; i < end; i = next) {
-        for (next = i + 1; next < end && rows[next] == rows[next - 1] + 1;) next++;
-        for (int64_t soon = std::min(end, i + 2 * AHEAD); soon < std::min(end, next + 2 * AHEAD); soon++)
-            prefetch_row(table + rows[soon] * channels, channels);
-        std::copy_n(table + rows[i] * channels, (next - i) * channels, values + i * channels);
-    }
-}
-
 // The sum of weights[n, b] * table[positions[n, b]] over b, of samples [begin, end).
 void mmpi_weighted_rows(int64_t begin, int64_t end, const float* numbers, const int32_t* positions,
                         const float* weights, int64_t rows, int64_t channels, int64_t, int64_t taps, float* values) {
@@ -116,7 +105,6 @@ IN_PARTS(mmpi_mark_rows)
 IN_PARTS(mmpi_count_rows)
 IN_PARTS(mmpi_list_rows)
 IN_PARTS(mmpi_place_rows)
-IN_PARTS(mmpi_take_rows)
 IN_PARTS(mmpi_weighted_rows)
 IN_PARTS(mmpi_sum_rows)
 IN_PARTS(mmpi_count_heads)
