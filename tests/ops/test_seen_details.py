@@ -15,7 +15,6 @@ from mmpi_ns.ops.details import FADE, HERE, MIDDLE, SAME_DEPTH, SAME_PIXELS, TUR
 LENS = [0.08, -0.02, 0.004, 0.0, 0.003, -0.002]
 HEIGHT, WIDTH = 20, 28
 KINDS = [CameraType.PERSPECTIVE, CameraType.FISHEYE]
-pytestmark = pytest.mark.usefixtures("form")
 
 
 def camera(x=0.0, y=0.0, z=0.0, turn=0.0, kind=CameraType.PERSPECTIVE, lens=None) -> Cameras:

@@ -1,5 +1,5 @@
-// Weight of a training image at the surface of a ray. C++ and GLSL both read this file: it stands at the head of the
-// page's shader (export/web.py), and Python reads its numbers (ops/details).
+// Weight of a training image at the surface of a ray: head of the page's shader (mmpi_show/web.py), whose numbers Python
+// reads, too (ops/details).
 const float TURN = 0.01;        // angle of viewing directions below which weights hardly grow, radians
 const float FADE = 0.2;         // angle at which a residual fades to a half, radians
 const float SAME_DEPTH = 0.05;  // relative difference of inverse depths within which two images show one surface

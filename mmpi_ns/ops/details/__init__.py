@@ -10,11 +10,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from mmpi_ns.ops.build import HEADERS
-from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import numbers_in
 
 TEXT = (HEADERS / "details.h").read_text(encoding="utf-8")
-"""Source of the constants and weights, valid in C++ and GLSL."""
+"""Source of the constants and weights in GLSL."""
 TURN, FADE, SAME_DEPTH, SAME_PIXELS, STRENGTH, HERE, MIDDLE, LEAST_WEIGHT, TINY = numbers_in(
     TEXT, "TURN", "FADE", "SAME_DEPTH", "SAME_PIXELS", "STRENGTH", "HERE", "MIDDLE", "LEAST_WEIGHT", "TINY"
 )
@@ -54,7 +53,6 @@ def project(
     return torch.stack([column, row], -1), inside
 
 
-@operation(in_cpp=256)
 def seen_details(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
