@@ -84,11 +84,6 @@ class BakedMpis:
     """Cache of the scene in the layout of the compiled operation."""
 
     @property
-    def sizes(self) -> dict[str, int]:
-        """Sizes of the letters in shapes: bricks, and MPIs, which are also the heads."""
-        return {"B": self.num_bricks, "K": len(self.mpis), "H": len(self.mpis)}
-
-    @property
     def num_bricks(self) -> int:
         return len(self.density)
 

@@ -24,7 +24,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
-from mmpi_ns.ops.layout import annotated, check_shapes
+from mmpi_ns.ops.layout import annotated
 from mmpi_ns.settings import Route
 from mmpi_ns.utils.errors import InputError, log
 
@@ -46,21 +46,17 @@ _choosing = threading.RLock()
 class Operation(Generic[P, R]):
     """A function defined in plain torch, with compiled forms of the same signature: for a CPU (C++, ``on_cpu``) and for
     a GPU (Triton, of the same name in the module ``gpu`` beside it). A call takes the form that suits its tensors.
-
-    Raises:
-        ValueError: by a call: the shape of a tensor is not that of its annotation (``layout.py``).
     """
 
     def __init__(
         self,
         reference: Callable[P, R],
         compiled: tuple[Form, ...],
-        check: Callable[..., None] | None,
         in_cpp: int | None,
         kernels: str | None = None,
     ) -> None:
         functools.update_wrapper(self, reference)
-        self.reference, self.compiled, self.check = reference, list(compiled), check
+        self.reference, self.compiled = reference, list(compiled)
         self.name, self.signature = reference.__name__, inspect.signature(reference)
         self.kernels = kernels or reference.__module__
         """The module of its compiled forms, with ``gpu`` beside it."""
@@ -78,19 +74,10 @@ class Operation(Generic[P, R]):
         return form
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        names = self.signature.parameters
-        if kwargs or len(args) != len(names):
-            bound = self.signature.bind(*args, **kwargs)
-            bound.apply_defaults()
-            arguments = bound.arguments
-        else:
-            arguments = dict(zip(names, args, strict=True))
-        check_shapes(self.reference, arguments)
-        values = tuple(arguments.values())
-        if self.check is not None:
-            self.check(*values)
-        form = form_of(self.name, *tensors_in(values))
-        return function(self.name, form)(*values)
+        bound = self.signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        form = form_of(self.name, *tensors_in(bound.args))
+        return function(self.name, form)(*bound.args)
 
     def _in_cpp(self, *values: Any) -> Any:
         """``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ as the form for a CPU.
@@ -127,21 +114,17 @@ OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 
 def operation(
-    *compiled: Form,
-    check: Callable[..., None] | None = None,
-    in_cpp: int | None = None,
-    kernels: str | None = None,
+    *compiled: Form, in_cpp: int | None = None, kernels: str | None = None
 ) -> Callable[[Callable[P, R]], Operation[P, R]]:
     """Decorator that makes a function an operation.
 
     Args:
         compiled: the forms in modules beside it.
-        check: takes the same arguments and raises errors that annotations cannot express.
         in_cpp: the form for a CPU is ``mmpi_NAME`` in C++ (``Operation._in_cpp``); rows of its first result that are
             worth another thread, 0: one thread computes all.
         kernels: module of the compiled forms, where it is not the definition's.
     """
-    return functools.partial(Operation, compiled=compiled, check=check, in_cpp=in_cpp, kernels=kernels)
+    return functools.partial(Operation, compiled=compiled, in_cpp=in_cpp, kernels=kernels)
 
 
 def on_gpu(x: Tensor) -> bool:

@@ -1,12 +1,12 @@
-"""Scene data of the operations and the shapes of their tensors: MPIs and cube, texels, raw density to optical depth."""
+"""Scene data of the operations: MPIs and cube, texels, raw density to optical depth."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, is_dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, get_args, get_type_hints
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from mmpi_ns.ops.build import structs
 from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import MPIPlan
-from mmpi_ns.scene.texels import BRICK, TexelGrid
+from mmpi_ns.scene.texels import TexelGrid
 
 
 class Tables(NamedTuple):
@@ -66,11 +66,6 @@ class SceneLayout:
     @property
     def num_heads(self) -> int:
         return len(self.grids)
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Sizes by the letters in shapes: rows of the tables, heads and MPIs."""
-        return {"T": len(self.grids[0].places) * BRICK, "H": self.num_heads, "K": len(self.mpis)}
 
     @cached_property
     def most_samples(self) -> int:
@@ -135,14 +130,8 @@ def frame_rows(frames: Frames) -> Float[Tensor, "K 19"]:
     return torch.cat([x.float() for x in parts], -1)
 
 
-def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A contiguous tensor of this shape and type, for compiled code, which checks nothing itself."""
-    assert x.shape == shape and x.dtype == dtype, f"{list(x.shape)} {x.dtype} where {list(shape)} {dtype} is read"
-    return x.contiguous()
-
-
 def dense(*tensors: Tensor | None, dtype: torch.dtype = torch.float32) -> list[Any]:
-    """``shaped`` for tensors whose shapes ``check_shapes`` has compared; None for None."""
+    """Contiguous tensors of this type, for compiled code, which checks nothing itself; None for None."""
     assert all(x is None or x.dtype == dtype for x in tensors), f"not all are {dtype}, which is read"
     return [x if x is None else x.contiguous() for x in tensors]
 
@@ -151,39 +140,6 @@ def dense_fields(values: Any) -> list[Any]:
     """``dense`` for the tensors of a named tuple, each of its annotated type."""
     forms = annotated(type(values))
     return [x for name, value in values._asdict().items() for x in dense(value, dtype=forms[name][1])]
-
-
-def check_shapes(owner: Callable[..., Any], values: Mapping[str, Any], sizes: dict[str, int] | None = None) -> None:
-    """Compares tensors with their annotations: a letter stands for one size wherever it occurs.
-
-    C++ and Triton read and write memory by shapes and check nothing. Tensors within named tuples are compared too; each
-    dataclass in a list has its own letters.
-
-    Args:
-        owner: a function or class with annotations such as ``Float[Tensor, "R S 3"]``.
-        values: its arguments or fields by name. Those with ``sizes`` (a layout, a baked scene) set letters first.
-        sizes: letters that are already set; others are added.
-
-    Raises:
-        ValueError: a tensor has another shape; the message names it.
-    """
-    letters = {} if sizes is None else sizes
-    for value in values.values():
-        letters |= {} if isinstance(value, Tensor) else getattr(value, "sizes", {})
-    for name, value in values.items():
-        if isinstance(value, Tensor):
-            form, _ = annotated(owner).get(name, (None, None))
-            if form is None:
-                continue
-            expected = [letters.setdefault(x, n) if isinstance(x, str) else x for x, n in zip(form, value.shape)]  # noqa: B905
-            if len(form) != value.ndim or expected != list(value.shape):
-                needed = f"{list(form)} is needed, with { {x: n for x, n in letters.items() if x in form} }"
-                raise ValueError(f"{name} has the shape {list(value.shape)} where {needed}")
-        elif isinstance(value, tuple) and hasattr(value, "_fields"):
-            check_shapes(type(value), value._asdict(), letters)  # type: ignore[attr-defined]
-        elif isinstance(value, list):
-            for each in filter(is_dataclass, value):
-                check_shapes(type(each), vars(each))
 
 
 @functools.cache

@@ -54,14 +54,7 @@ def activate(raw: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
     return torch.cat([raw[:, :COLORS].sigmoid(), raw[:, COLORS:].tanh()], -1)
 
 
-def check_taps(values: Tensor, taps: list[Taps], slots: Tensor, *_: Tensor) -> None:
-    if (sizes := [each.weights.shape[1] for each in taps]) not in ([], [4], [8], [4, 8]):
-        raise ValueError(f"taps of {sizes} texels where those of planes have 4, and those of the cube after them 8")
-    if (count := sum(len(each.positions) for each in taps)) != len(slots):
-        raise ValueError(f"slots has the shape {list(slots.shape)} where the taps are of {count} samples")
-
-
-@operation("gpu", check=check_taps)
+@operation("gpu")
 def gather_taps(
     values: Float[Tensor, "U C"],
     taps: list[Taps],

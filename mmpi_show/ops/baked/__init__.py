@@ -18,7 +18,7 @@ from mmpi_ns.ops.composite import median_inverse_distance, winning_heads
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import OPAQUE_BAKED
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.ops.layout import dense, dense_fields, frame_rows, shaped
+from mmpi_ns.ops.layout import dense, dense_fields, frame_rows
 from mmpi_ns.ops.march import RayOutputs, Rays, ray_outputs
 from mmpi_ns.scene.geometry import Frames
 from mmpi_show.ops import OPS
@@ -92,6 +92,12 @@ def shade_baked(
     mean = (gathered / mass.clamp(min=1e-6)).double().numpy()
     window = {"shader": network, "network_array": numbers.detach().numpy()}
     return torch.from_numpy(reader.shade(window, mean, directions.double().numpy())).to(gathered)
+
+
+def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """A contiguous tensor of this shape and type, for compiled code, which checks nothing itself."""
+    assert x.shape == shape and x.dtype == dtype, f"{list(x.shape)} {x.dtype} where {list(shape)} {dtype} is read"
+    return x.contiguous()
 
 
 @render_baked.on_cpu

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.ops.build import arguments, library, structs
-from mmpi_ns.ops.layout import check_shapes, dense
+from mmpi_ns.ops.layout import dense
 from mmpi_show.ops import OPS
 
 BLUR = 0.3
@@ -81,8 +81,7 @@ def splat_errors(
 
 def _run(function: Callable[..., Tensor], gaussians: Gaussians, view: View, out: Tensor, **tensors: Tensor) -> None:
     """Calls the compiled form of a function, which writes to ``out``."""
-    (width, height), count = view.size, len(gaussians.means)
-    check_shapes(function, {"gaussians": gaussians, "view": view, **tensors}, {"W": width, "H": height, "N": count})
+    count = len(gaussians.means)
     numbers = map(float, (*view.to_world.flatten(), *view.focal, *view.center))
     inputs = dense(*gaussians, *tensors.values())
     camera, seen = structs((*numbers, *map(ctypes.c_int32, view.size))), structs((count, *inputs[:3]))
