@@ -95,24 +95,6 @@ inline Lanes gather(const float* table, IntLanes at) {
     return each_lane<Lanes>(at, [table](int32_t i) { return table[i]; });
 }
 
-// 1 / x to 1e-7, for x >= 1e-12.
-inline Lanes reciprocal(Lanes x) {
-#ifdef __AVX512F__
-    const Lanes rough = Lanes(_mm512_rcp14_ps(__m512(x)));
-    return rough * (2.0f - x * rough);
-#endif
-    return 1.0f / x;
-}
-
-// 1 / sqrt(x) to 1e-6, for x >= 1e-20.
-inline Lanes inverse_root(Lanes x) {
-#ifdef __AVX512F__
-    const Lanes rough = Lanes(_mm512_rsqrt14_ps(__m512(x)));
-    return rough * (1.5f - 0.5f * x * rough * rough);
-#endif
-    return 1.0f / root(x);
-}
-
 inline void store(float* to, Lanes x) { __builtin_memcpy(to, &x, sizeof x); }
 inline void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
 
@@ -165,23 +147,4 @@ inline Lanes softplus_lanes(Lanes x) {
     p = p * q + 1.0f / 3;
     p = p * q + 1.0f;
     return most(x, Lanes{}) + 2.0f * z * p;
-}
-
-// sin(pi x) for |x| <= 1/2 (its Taylor series: 6e-8 at the ends).
-inline Lanes sin_half_turn(Lanes x) {
-    const Lanes z = x * 3.14159265f, q = z * z;
-    Lanes p = splat(-1.0f / 39916800);
-    p = p * q + 1.0f / 362880;
-    p = p * q - 1.0f / 5040;
-    p = p * q + 1.0f / 120;
-    p = p * q - 1.0f / 6;
-    return z + z * q * p;
-}
-
-// sin(pi x) and cos(pi x) for |x| <= 1.
-inline void sincos_turn(Lanes x, Lanes& sine, Lanes& cosine) {
-    const Lanes size = magnitude(x), folded = least(size, 1.0f - size);
-    const Lanes s = sin_half_turn(folded);
-    sine = x < 0 ? -s : s;
-    cosine = sin_half_turn(0.5f - size);
 }

@@ -8,6 +8,15 @@
 
 namespace {
 
+// 1 / sqrt(x) to 1e-6, for x >= 1e-20.
+Lanes inverse_root(Lanes x) {
+#ifdef __AVX512F__
+    const Lanes rough = Lanes(_mm512_rsqrt14_ps(__m512(x)));
+    return rough * (1.5f - 0.5f * x * rough * rough);
+#endif
+    return 1.0f / root(x);
+}
+
 constexpr int REACH = 3, SIDE = 2 * REACH + 1, PIXELS = SIDE * SIDE, BITS = 5, STEPS = 1 << BITS; // as in __init__.py
 
 // An image, or what another one shows of its pixels, in rows of whole lanes; and sums over windows about the pixels of

@@ -6,6 +6,15 @@
 
 namespace {
 
+// 1 / x to 1e-7, for x >= 1e-12.
+Lanes reciprocal(Lanes x) {
+#ifdef __AVX512F__
+    const Lanes rough = Lanes(_mm512_rcp14_ps(__m512(x)));
+    return rough * (2.0f - x * rough);
+#endif
+    return 1.0f / x;
+}
+
 constexpr int REACH = 2, SIDE = 2 * REACH + 1, PIXELS = SIDE * SIDE, LEVELS = 3; // as in __init__.py
 constexpr float LEAST_AHEAD = 1e-6f, LEAST_SHARE = 0.2f, LEAST_SQUARES = PIXELS, ALONE = 0.1f, GRAZING = 0.05f;
 

@@ -8,6 +8,25 @@
 
 namespace {
 
+// sin(pi x) for |x| <= 1/2 (its Taylor series: 6e-8 at the ends).
+Lanes sin_half_turn(Lanes x) {
+    const Lanes z = x * 3.14159265f, q = z * z;
+    Lanes p = splat(-1.0f / 39916800);
+    p = p * q + 1.0f / 362880;
+    p = p * q - 1.0f / 5040;
+    p = p * q + 1.0f / 120;
+    p = p * q - 1.0f / 6;
+    return z + z * q * p;
+}
+
+// sin(pi x) and cos(pi x) for |x| <= 1.
+void sincos_turn(Lanes x, Lanes& sine, Lanes& cosine) {
+    const Lanes size = magnitude(x), folded = least(size, 1.0f - size);
+    const Lanes s = sin_half_turn(folded);
+    sine = x < 0 ? -s : s;
+    cosine = sin_half_turn(0.5f - size);
+}
+
 struct Layer {
     int64_t outputs, inputs;
     const float *weights, *biases; // [outputs, inputs], [outputs]
