@@ -7,13 +7,17 @@ element uses two hooks of the viewer: ``install`` creates controls, ``_setup`` r
 from __future__ import annotations
 
 import time
+from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
+from torch import Tensor
 from viser import CameraHandle, ClientHandle, ViserServer
+
+from mmpi_ns.training.frames import FrameThread
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
@@ -21,14 +25,18 @@ if TYPE_CHECKING:
 
 START = 1 / 6
 """Place on the path where a window opens: the middle of its first third."""
+LITTLE = 1 / 3
+"""Opaque share of an image below which a button back to the path appears."""
+CAMERAS_PER_SECOND = 4.0
+"""Maximum speed of Play, which moves by the distance of the first content in a second."""
 AHEAD = 0.01
 """Distance to the point that a drag rotates about, in distances of the first content: the camera stays in place."""
 NEAREST = 0.02
 """Scene units; the viewer comes no nearer than half of it to that point."""
 PACE = 2.0
 """Distances of the first content that the wheel walks while the page would divide the distance ahead by e."""
-COARSE_FRAMES = 10
-"""Frames a second while the camera moves, which gives their size (nerfstudio's: 30)."""
+FRAMES_PER_SECOND = 10.0
+"""Poses a second that Play sends."""
 
 
 class View(NamedTuple):
@@ -82,18 +90,21 @@ def fitting_fov(half_width: float, half_height: float, aspect: float) -> float:
 
 
 class PathControls(ViewerElement[float], ViewerControl):
-    """Initial camera of every window, and the controls: a slider and Nearest camera."""
+    """Initial camera of every window, and the controls slider, Play and Nearest camera."""
 
     def __init__(self) -> None:
         super().__init__("Captured path", cb_hook=lambda _: None)
         self._path: CapturedPath | None = None
+        self._walker: ClientHandle | None = None
 
     def install(self, viser_server: ViserServer) -> None:
         """Creates the controls; the viewer calls it inside the model's folder."""
         gui = viser_server.gui
         self.gui_handle = self._slider = gui.add_slider("Captured path", 0.0, 1.0, 0.001, START)
+        self._play = gui.add_checkbox("Play", False)
         nearest = gui.add_button("Nearest camera")
         self._slider.on_update(self._walk)
+        self._play.on_update(self._start_playing)
         nearest.on_click(self._go_to_nearest)
 
     def _setup(self, viewer: Viewer) -> None:
@@ -115,7 +126,17 @@ class PathControls(ViewerElement[float], ViewerControl):
 
     def _open(self, client: ClientHandle) -> None:
         assert self._path is not None
-        aspect, walked = 0.0, 0.0
+        viewer, aspect, walked = self.viewer, 0.0, 0.0
+        model: Any = viewer.get_model()
+        # Above the tabs, where nothing is scrolled away.
+        line = client.gui.add_markdown("Little was captured from here:", order=-2, visible=False)
+        back = client.gui.add_button("Back to the path", order=-1, visible=False)
+        back.on_click(self._go_to_nearest)
+
+        def offer(outputs: dict[str, Tensor]) -> None:
+            is_whole = model.show.value == "all" and not viewer.control_panel.crop_viewport
+            little = is_whole and float((outputs["accumulation"] > 0.5).float().mean()) < LITTLE
+            line.visible = back.visible = little
 
         def follow(camera: CameraHandle) -> None:
             nonlocal aspect, walked
@@ -130,7 +151,10 @@ class PathControls(ViewerElement[float], ViewerControl):
                 position = camera.position / VISER_NERFSTUDIO_SCALE_RATIO + PACE * self._near * nearer * direction
                 self._show(camera, View(position, direction, camera.up_direction))
 
-        self.viewer.render_statemachines[client.client_id].target_fps = COARSE_FRAMES
+        threads, number = viewer.render_statemachines, client.client_id
+        threads[number].running, threads[number].interrupt_render_flag = False, True  # it renders nothing any more
+        threads[number] = FrameThread(viewer, client, getattr(viewer.trainer, "turns", None), offer)
+        threads[number].start()
         follow(client.camera)
         client.camera.on_update(follow)
         self._show(client.camera, self._path.at(self._path.start))
@@ -142,11 +166,30 @@ class PathControls(ViewerElement[float], ViewerControl):
             camera.look_at = (view.position + self._ahead * view.direction) * VISER_NERFSTUDIO_SCALE_RATIO
 
     def _walk(self, event: Any) -> None:
-        if self._path is not None and event.client is not None:
-            self._show(event.client.camera, self._path.at(self._slider.value * (len(self._path) - 1)))
+        client = event.client or self._walker
+        if self._path is not None and client is not None:
+            self._show(client.camera, self._path.at(self._slider.value * (len(self._path) - 1)))
 
     def _go_to_nearest(self, event: Any) -> None:
         if self._path is not None and event.client is not None:
             i = self._path.nearest(event.client.camera.position / VISER_NERFSTUDIO_SCALE_RATIO)
             self._show(event.client.camera, self._path.at(i))
-            self._slider.value = i / max(len(self._path) - 1, 1)
+            self._slider.value = i / max(len(self._path) - 1, 1)  # Play goes on from there
+
+    def _start_playing(self, event: Any) -> None:
+        if self._play.value and event.client is not None:
+            self._walker = event.client
+            Thread(target=self._keep_playing, args=[event.client], daemon=True).start()
+
+    def _keep_playing(self, client: ClientHandle) -> None:
+        """Moves along the path until Play is off, the window is closed, or the path ends."""
+        assert self._path is not None
+        length = float(np.linalg.norm(np.diff(self._path.positions, axis=0), axis=-1).sum())
+        pace = min(self._near / max(length, 1e-6), CAMERAS_PER_SECOND / max(len(self._path) - 1, 1))
+        if self._slider.value >= 1:
+            self._slider.value = 0.0
+        while self._play.value and client.client_id in self.viser_server.get_clients() and self._slider.value < 1:
+            self._slider.value = min(self._slider.value + pace / FRAMES_PER_SECOND, 1.0)
+            time.sleep(1 / FRAMES_PER_SECOND)
+        self._walker = None
+        self._play.value = False

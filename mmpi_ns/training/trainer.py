@@ -11,6 +11,7 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
+from nerfstudio.viewer.viewer import Viewer
 from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.data.datamanager import MMPIDataManager
@@ -36,6 +37,7 @@ from mmpi_ns.training.checkpoints import (
     read_checkpoint,
     states_of,
 )
+from mmpi_ns.training.frames import FrameTurns
 from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.report import TrainingLog, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, views_of
@@ -61,6 +63,7 @@ class MMPITrainer(Trainer):
         with signals_go_to(_end), one_thread_each():
             if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
                 torch.cuda.set_device(self.local_rank)
+            self.turns = FrameTurns(lambda: self.training_state == "training")
             self._stopped_by: int | None = None
             self._compared = False
             self._log: TrainingLog | None = None
@@ -219,6 +222,12 @@ class MMPITrainer(Trainer):
         for values in others:
             values.update({name: v.detach() for name, v in values.items() if isinstance(v, torch.Tensor)})
         return loss.detach(), *others
+
+    def _update_viewer_state(self, step: int) -> None:
+        if isinstance(self.viewer_state, Viewer):
+            self.turns.after_step(self.viewer_state, step)
+        else:
+            super()._update_viewer_state(step)
 
     def _after_train(self) -> None:
         """Saves with the number of the last step that ran; nerfstudio 1.1.5 would use the next one after a stop."""

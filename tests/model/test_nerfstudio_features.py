@@ -193,6 +193,20 @@ def test_the_viewer_serves_its_page_renders_and_shows_one_mpi_alone(viewer):
     assert alone.shape == first.shape and np.abs(alone - first).mean() > 0.003
 
 
+def test_each_of_two_windows_has_its_own_view_and_way_back(viewer):
+    trainer, port = viewer
+    pose = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[2].double().numpy()
+    one, other = Browser(port), Browser(port)
+    for window in (one, other):
+        window.look(pose)
+        assert window.settled().std() > 0.05
+    one.look(pose @ np.diag([-1.0, 1.0, -1.0, 1.0]))  # to where nothing was captured
+    shown = one.wait_for(lambda m: m.get("updates") == {"visible": True})
+    assert one.settled().std() < 0.05
+    with pytest.raises(TimeoutError):
+        other.wait_for(lambda m: m["type"] == "BackgroundImageMessage" or m.get("id") == shown["id"], timeout=2)
+
+
 def test_tensorboard_has_the_losses_and_the_sample_counts(run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

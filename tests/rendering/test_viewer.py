@@ -6,16 +6,23 @@ import re
 import signal
 import time
 from contextlib import contextmanager
+from itertools import cycle
+from threading import Thread
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, browser
 from forked import start, start_train, train
+from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMachine
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from numpy.testing import assert_allclose
 from PIL import Image
 from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, pixel_rays, pose_of, write_scene
 from training_runs import write_plan
 
+from mmpi_ns.training import frames
+from mmpi_ns.training.frames import PATIENCE, SHARE, FrameThread, FrameTurns
 from mmpi_ns.viewer import CapturedPath, fitting_fov
 
 
@@ -64,6 +71,89 @@ def test_a_window_lies_inside_the_image(aspect):
     assert half_height == pytest.approx(0.5) or half_height * aspect == pytest.approx(1.0)
 
 
+STEP = 0.1
+"""Seconds of a training step by the clock of the tests below, which is not that of the machine."""
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    now = SimpleNamespace(seconds=100.0)
+    monkeypatch.setattr(frames, "time", SimpleNamespace(monotonic=lambda: now.seconds))
+    return now
+
+
+@pytest.fixture
+def window(clock, monkeypatch):
+    """A window of a training, whose frames take ``window.takes`` seconds."""
+
+    def render(self, _):
+        clock.seconds += self.takes
+        self.rendered += 1
+
+    monkeypatch.setattr(RenderStateMachine, "_render_img", render)
+    viewer = SimpleNamespace(
+        update_step=lambda _: None, update_camera_poses=lambda: None, get_camera_state=lambda _: None
+    )
+    thread = FrameThread(viewer, None, FrameTurns(lambda: True), lambda _: None)
+    thread.rendered, viewer.render_statemachines = 0, {0: thread}
+    thread.turns.after_step(viewer, 0)
+    return thread
+
+
+def step(clock, window, wants):
+    """A training step, after which the window wants a frame; whether it was rendered."""
+    clock.seconds += STEP
+    before = window.rendered
+    while wants and window.idle.is_set():
+        time.sleep(0.001)
+    window.turns.after_step(window.viewer, 1)
+    return window.rendered > before
+
+
+@pytest.mark.parametrize("takes", [0.025, 0.15])
+def test_frames_of_one_who_moves_take_their_share_of_a_training(clock, window, takes):
+    window.state, window.takes, began = "low_move", takes, clock.seconds
+    Thread(target=lambda: [window._render_img(None) for _ in range(10_000)], daemon=True).start()
+    while clock.seconds < began + 60:
+        step(clock, window, wants=True)
+    assert 0.8 * SHARE < window.rendered * takes / (clock.seconds - began) < 0.08
+    window.takes = 10.0  # once, as when something was compiled
+    while not step(clock, window, wants=True):
+        pass
+    began, window.takes = clock.seconds, takes
+    while not step(clock, window, wants=True):
+        pass
+    assert clock.seconds - began <= PATIENCE["coarse"] + STEP + takes + 1e-9
+
+
+def test_one_who_stops_sees_a_sharp_frame_soon_and_later_ones_in_their_share(clock, window):
+    window.state, window.takes, steps = "high", 0.7, 0
+    for soon in (0, PATIENCE["sharp"]):  # again after the share is used up
+        asks, began = Thread(target=window._render_img, args=[None], daemon=True), clock.seconds
+        asks.start()
+        while not step(clock, window, wants=True):
+            pass
+        asks.join()
+        assert clock.seconds - began <= soon + STEP + window.takes + 1e-9
+    while window.next_action is None:  # nobody has moved since
+        steps += not step(clock, window, wants=False)
+    assert window.next_action.action == "step" and steps * STEP >= 0.9 * window.takes / SHARE
+
+
+def test_a_pose_that_waits_for_its_turn_gives_way_to_a_newer_one(window):
+    window.state, window.next_action, window.interrupt_render_flag = "high", RenderAction("move", None), True
+    with pytest.raises(IOChangeException):
+        window._render_img(None)
+    assert window.idle.is_set() and not window.interrupt_render_flag and not window.rendered
+
+
+def test_frames_do_not_wait_for_a_paused_training(window):
+    window.takes, window.turns = 0.7, FrameTurns(lambda: False)
+    window.turns.after_step(window.viewer, 1)
+    window._render_img(None)
+    assert window.rendered
+
+
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with (apt-get install chromium)")
 PANEL, BAR = 320, 51.19
 """Pixels beside and above the picture."""
@@ -102,16 +192,13 @@ def picture(tab):
     return np.asarray(shot.resize((WIDTH, HEIGHT), Image.Resampling.BOX, (0, BAR, WINDOW[0] - PANEL, WINDOW[1]))) / 255
 
 
-def psnr_of(tab, truth):
-    return -10 * np.log10(np.square(picture(tab) - truth).mean())
-
-
-def until_it_resembles(tab, truth):
+def until_it_resembles(tab, truth, wait=100):
     """Waits for a picture of more than 20 dB."""
-    end = time.monotonic() + 100
-    while psnr_of(tab, truth) <= 20 and time.monotonic() < end:
+    end, psnr = time.monotonic() + wait, 0.0
+    while psnr <= 20 and time.monotonic() < end:
         time.sleep(0.5)
-    assert psnr_of(tab, truth) > 20, tab.messages
+        psnr = -10 * np.log10(np.square(picture(tab) - truth).mean())
+    assert psnr > 20, (psnr, tab.messages)
 
 
 def turned(angle):
@@ -131,7 +218,7 @@ def drag(tab, pixels):
 
 
 @in_browser
-def test_ns_viewer_opens_at_a_training_image_and_follows_a_drag(options, tmp_path):
+def test_ns_viewer_opens_at_a_training_image_and_knows_the_way_back(options, tmp_path):
     trained = train(output=tmp_path, max_num_iterations=300, **options)
     assert trained.status == 0, trained.error[-3000:]
     config = next(tmp_path.glob("**/config.yml"))
@@ -139,17 +226,27 @@ def test_ns_viewer_opens_at_a_training_image_and_follows_a_drag(options, tmp_pat
     with page(command, tmp_path / "profile") as tab:
         until_it_resembles(tab, turned(0))
         until_it_resembles(tab, drag(tab, 12))
+        drag(tab, 180)
+        back = "[...document.querySelectorAll('button')].find(b => b.innerText == 'Back to the path')"
+        tab.until(f"{back}?.checkVisibility() && {back}.click() === undefined", wait=100)
+        until_it_resembles(tab, turned(0))
+        tab.until(f"!{back}?.checkVisibility()", wait=100)
 
 
 @in_browser
-def test_ns_train_shows_where_one_looks_while_it_trains(options, tmp_path):
+def test_ns_train_shows_a_training_image_and_goes_on_while_one_moves(options, tmp_path):
     command = start_train(output=tmp_path / "run", vis="viewer", max_num_iterations=100_000, **options)
     with page(command, tmp_path / "profile") as tab:
-        tab.until("document.body?.innerText.includes('Step: ')", wait=100)
-        time.sleep(5)  # until the camera stands where it opens
-        truth, end = drag(tab, 12), time.monotonic() + 300
-        while psnr_of(tab, truth) <= 20 and time.monotonic() < end:  # nerfstudio renders most for one who moves
-            drag(tab, -12)
-            drag(tab, 12)
-            time.sleep(10)
-        assert psnr_of(tab, truth) > 20 and command.process.is_alive()
+        until_it_resembles(tab, turned(0))
+        until_it_resembles(tab, drag(tab, 12))
+        before, end, places = step_of(tab), time.monotonic() + 100, cycle([150, 151])
+        tab.mouse("mousePressed", 150, 250, button="left", clickCount=1, buttons=1)
+        while step_of(tab) < before + 20 and time.monotonic() < end:
+            tab.mouse("mouseMoved", next(places), 250, button="left", buttons=1)
+            time.sleep(0.02)
+        assert step_of(tab) >= before + 20
+        assert command.process.is_alive()
+
+
+def step_of(tab):
+    return int(re.search(r"Step: (\d+)", tab.evaluate("document.body.innerText"))[1])

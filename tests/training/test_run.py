@@ -11,6 +11,8 @@ from mmpi_ns.field.tables import TABLES
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.memory import Work, training_bytes
+from mmpi_ns.training.phases import Phase, Schedule
+from mmpi_ns.training.report import EARLY_COST, TrainingLog
 from mmpi_ns.training.storage import MOST_COPIED, copy_finely, refine
 from mmpi_ns.training.touched_adam import TouchedAdam
 
@@ -65,3 +67,11 @@ def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(shar
     plane, y, x = place // 64, place // 8 % 8, place % 8
     assert (copy.own_tiles[plane, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2] > 0).all(), "the brick of the largest gain"
     assert mpi.own_tiles[plane, y, x] == 0, "which the MPI gives up"
+
+
+def test_the_time_left_knows_that_steps_cost_less_once_surfaces_have_formed():
+    schedule = Schedule((Phase("joint", 0, 100),), (10, 20), 1.0, 0.0, windows=2)
+    log = TrainingLog(schedule, rays=64, first=0)
+    assert log.remaining(149) == 50 and log.remaining(199) == 0
+    assert log.remaining(110) == pytest.approx(9 + 80 / EARLY_COST)
+    assert log.remaining(20) == pytest.approx(79 + 20 * EARLY_COST + 80)
