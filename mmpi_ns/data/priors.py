@@ -102,17 +102,13 @@ class Gains:
 
     def describe(self) -> str:
         """Whether and how much exposure varies, in one sentence."""
-        differ = f"where images show the same, colours differ by {100 * self.disagreement:.1f} %"
+        before, after, error = (100 * x for x in (self.disagreement, self.corrected, float(np.median(self.errors))))
+        differ = f"where images show the same, colours differ by {before:.1f} %"
         if self.matter:
-            return (
-                f"Exposure varies {self.span:.2f}-fold between images and is corrected: {differ}, and corrected by "
-                f"{100 * self.corrected:.1f} %."
-            )
-        error = 100 * float(np.median(self.errors))
-        return (
-            f"Exposure is not corrected: {differ}; with a factor for each image, known to {error:.1f} %, by "
-            f"{100 * self.corrected:.1f} %."
-        )
+            varies = f"Exposure varies {self.span:.2f}-fold between images and is corrected"
+            return f"{varies}: {differ}, and by {after:.1f} % after that."
+        factors = f"by {after:.1f} % with a factor for each image, known to {error:.1f} %"
+        return f"Exposure is not corrected: {differ}, and {factors}."
 
     @property
     def from_field(self) -> Float[ndarray, "N 3"]:
