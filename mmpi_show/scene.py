@@ -17,6 +17,8 @@ import torch
 from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor
 
+from mmpi_ns.field.shading import LEAST_MASS, positional_encoding
+from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.scene.columns import WORD, bits_of
 from mmpi_ns.scene.plan import MPIPlan
 
@@ -56,6 +58,16 @@ class Shader:
     """Frequencies of the direction's positional encoding."""
     bound: float
     """The network's output x changes the odds c / (1 - c) of the mean colour by e^(bound tanh(x / bound))."""
+
+    def shade(
+        self, gathered: Float[Tensor, "R C"], mass: Float[Tensor, "R 1"], directions: Float[Tensor, "R 3"]
+    ) -> Float[Tensor, "R 3"]:
+        """Colours of rays from their sums and masses (``RayOutputs``), and their directions: unit, world axes."""
+        mean = gathered / mass.clamp(min=LEAST_MASS)
+        x, color = torch.cat([mean, positional_encoding(directions, self.direction_octaves)], -1), mean[:, :COLORS]
+        for number, (weights, biases) in enumerate(self.layers):
+            x = torch.nn.functional.linear(x.relu_() if number else x, weights, biases)
+        return color / (color + (1 - color) * torch.exp(-self.bound * torch.tanh(x / self.bound)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from mmpi_ns.scene import geometry
 from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
-from mmpi_show.ops.baked import render_baked, shade_baked
+from mmpi_show.ops.baked import render_baked
 from mmpi_show.scene import CELLS, MOST_CHANNELS, SIDE, BakedMpis, Codes, Shader, brick_numbers
 
 THINNEST = -12.0
@@ -74,7 +74,7 @@ class BakedWindow:
         """
         rays = Rays(*(x.cpu() for x in (origins, directions, *(bounds or self.unbounded(origins)))))
         marched = render_baked(self.mpis, rays, self.threshold)
-        shaded = shade_baked(self.shader, marched.gathered, marched.mass, rays.directions)
+        shaded = self.shader.shade(marched.gathered, marched.mass, rays.directions)
         rgb = torch.where(marched.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
         behind = self.background if background is None else background.cpu()
         outputs = {

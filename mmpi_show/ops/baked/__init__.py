@@ -1,7 +1,4 @@
-"""Rays through baked multi-plane images, front to back until they are opaque, and their colours.
-
-Both are defined by ``reader.py``, in float64.
-"""
+"""Rays through baked multi-plane images, front to back until they are opaque; defined by ``reader.py``, in float64."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import call_in_parts, structs
+from mmpi_ns.ops.build import structs
 from mmpi_ns.ops.composite import median_inverse_distance, winning_heads
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import OPAQUE_BAKED
@@ -23,7 +20,7 @@ from mmpi_ns.ops.march import RayOutputs, Rays, ray_outputs
 from mmpi_ns.scene.geometry import Frames
 from mmpi_show.ops import OPS
 from mmpi_show.ops.baked import reader
-from mmpi_show.scene import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, tiles_of
+from mmpi_show.scene import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, tiles_of
 
 
 @operation()
@@ -71,29 +68,6 @@ def render_baked(
     return RayOutputs(*(x.to(rays.origins) for x in outputs))
 
 
-@operation()
-def shade_baked(
-    shader: Shader,
-    gathered: Float[Tensor, "R C"],
-    mass: Float[Tensor, "R 1"],
-    directions: Float[Tensor, "R 3"],
-) -> Float[Tensor, "R 3"]:
-    """Colours of rays from their sums.
-
-    Args:
-        shader: the network.
-        gathered: see ``RayOutputs``.
-        mass: likewise.
-        directions: unit, world axes.
-    """
-    numbers = torch.cat([x.flatten() for layer in shader.layers for x in layer])
-    layers = [tuple(weights.shape) for weights, _ in shader.layers]
-    network = {"direction_octaves": shader.direction_octaves, "layers": layers, "bound": shader.bound}
-    mean = (gathered / mass.clamp(min=1e-6)).double().numpy()
-    window = {"shader": network, "network_array": numbers.detach().numpy()}
-    return torch.from_numpy(reader.shade(window, mean, directions.double().numpy())).to(gathered)
-
-
 def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     """A contiguous tensor of this shape and type, for compiled code, which checks nothing itself."""
     assert x.shape == shape and x.dtype == dtype, f"{list(x.shape)} {x.dtype} where {list(shape)} {dtype} is read"
@@ -132,18 +106,3 @@ def render_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: T
         assert dense(peaks)[0] is peaks, "peaks are written in place"
     walk = (scene.packed["cpu"], structs(dense_fields(rays)), float(threshold), peaks)
     return ray_outputs("mmpi_render_baked", len(rays.origins), len(scene.channel_codes), *walk, folder=OPS)
-
-
-@shade_baked.on_cpu
-def shade_baked_on_cpu(shader: Shader, gathered: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
-    num_rays, channels = gathered.shape
-    numbers, inputs = [], channels + 3 * (1 + 2 * shader.direction_octaves)
-    for weights, biases in shader.layers:  # referenced until the kernel has run
-        numbers.append((shaped(weights, len(biases), inputs), shaped(biases, len(biases))))
-        inputs = len(biases)
-    assert inputs == COLORS, f"a network of {inputs} outputs where a colour is read"
-    rgb, sizes = torch.empty(num_rays, 3), (len(numbers), channels, shader.direction_octaves, float(shader.bound))
-    layers = structs(*((*weights.shape, weights, biases) for weights, biases in numbers))
-    values = (layers, *sizes, *dense(gathered, mass, directions), rgb)
-    call_in_parts("mmpi_shade_baked", num_rays, *values, folder=OPS)
-    return rgb
