@@ -26,7 +26,7 @@ from mmpi_ns.utils.parallel import in_order, torch_apart
 from mmpi_show.codes import smoothed_codes
 from mmpi_show.details import stored_view
 from mmpi_show.files import BakedScene, Pose
-from mmpi_show.scene import most_of_copies, neighbours
+from mmpi_show.scene import most_of_copies
 from mmpi_show.windows import BakedWindow, bake
 
 SLACK = 0.01
@@ -111,7 +111,7 @@ def smoothed(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> BakedWindow:
         peaks: largest weights of its texels in training views.
     """
     mpis = window.mpis
-    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    beside = mpis.neighbours()
     most = most_of_copies(peaks, beside)
     slacks = [(SLACK / codes.step / most).clamp(max=255).to(torch.uint8) for codes in mpis.channel_codes]
     channels = zip(mpis.texels.unbind(-1), slacks, strict=True)

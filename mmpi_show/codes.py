@@ -1,7 +1,7 @@
 """Stored form of the codes of bricks: differences from neighbouring codes, which gzip compresses well (docs/export.md).
 
 Every second row and column of a brick is stored first: with these, a page renders the brick at half of its resolution.
-Nothing is stored twice. ``ops/baked/reader.py`` joins them again.
+Nothing is stored twice. ``reader.py`` joins them again.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from jaxtyping import Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_show.scene import CELLS, SIDE, take_borders
+from mmpi_show.reader import take_borders
+from mmpi_show.scene import CELLS, SIDE
 
 COARSE = np.zeros((SIDE, SIDE), bool)
 """Texels that are stored first."""
@@ -22,7 +23,7 @@ COARSE[::2, ::2] = True
 
 
 def smoothed_codes(
-    codes: UInt8[Tensor, "B 8 8"], slack: UInt8[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]
+    codes: UInt8[Tensor, "B 8 8"], slack: UInt8[Tensor, "B 8 8"], beside: Int[np.ndarray, "2 B"]
 ) -> UInt8[Tensor, "B 8 8"]:
     """Codes of a channel that take fewer bytes: those whose stored differences are at most their slack are replaced by
     the prediction from their neighbours, so that 0 is stored.
@@ -44,13 +45,13 @@ def smoothed_codes(
         settle(np.s_[:, y, x], smooth[:, y + 2, x] + smooth[:, y, x + 2] - smooth[:, y, x])
     settle(np.s_[:, ::2, 1::2], _means(inside[:, ::2, ::2], 2))
     settle(np.s_[:, 1::2], _means(inside[:, ::2], 1))
-    joined = torch.from_numpy(inside.astype(np.uint8))
+    joined = inside.astype(np.uint8)
     take_borders(joined, beside)
-    return joined
+    return torch.from_numpy(joined)
 
 
 def split_codes(
-    codes: UInt8[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]
+    codes: UInt8[Tensor, "B 8 8"], beside: Int[np.ndarray, "2 B"]
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Coarse codes [B, 4, 4], and the stored form of the others [48, B]: differences, modulo 256, from the means of
     those beside them; 0 for border texels that a neighbour also contains.
@@ -59,7 +60,7 @@ def split_codes(
         codes: of all bricks.
         beside: the bricks right of each brick and below it, -1 for none.
     """
-    fine, (right, below) = codes.numpy().copy(), (beside >= 0).numpy()
+    fine, (right, below) = codes.numpy().copy(), beside >= 0
     coarse = fine[:, ::2, ::2].copy()
     fine[:, 1::2] -= _means(fine[:, ::2], 1)
     fine[:, ::2, 1::2] -= _means(coarse, 2)

@@ -31,10 +31,10 @@ from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order, torch_apart
+from mmpi_show import reader
 from mmpi_show.codes import coarse_differences, split_codes
 from mmpi_show.details import STEP, StoredView, restored_view
-from mmpi_show.ops.baked import reader
-from mmpi_show.scene import SIDE, BakedMpis, Codes, Shader, neighbours
+from mmpi_show.scene import SIDE, BakedMpis, Codes, Shader
 from mmpi_show.windows import BakedWindow
 
 FORMAT, VERSION = "mmpi-baked", 5
@@ -196,7 +196,7 @@ def _write_window(file: Path, place: Window, window: BakedWindow, views: list[St
 def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
     """Arrays of a window in the order of its file, which ``behind`` bytes of details follow."""
     mpis = window.mpis
-    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    beside = mpis.neighbours()
     channels = [mpis.density, *mpis.texels.unbind(-1)]
     coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
     network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]

@@ -9,18 +9,20 @@ planes that a ray can skip.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from mmpi_ns.field.shading import LEAST_MASS, positional_encoding
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.scene.columns import WORD, bits_of
+from mmpi_ns.scene.columns import WORD
 from mmpi_ns.scene.plan import MPIPlan
+from mmpi_show import reader
 
 SIDE = 8
 """Texels along each side of a baked brick."""
@@ -103,6 +105,14 @@ class BakedMpis:
         """First column of MPI k; for k = K, the number of columns."""
         return sum(math.prod(tiles_of(m)) for m in self.mpis[:k])
 
+    def brick_numbers(self) -> Iterator[Int[Tensor, "P Y X"]]:
+        """Brick of every tile of each MPI; -1 if it is empty."""
+        return map(torch.from_numpy, reader.brick_numbers(self.columns.numpy(), list(map(vars, self.mpis))))
+
+    def neighbours(self) -> Int[np.ndarray, "2 B"]:
+        """The bricks to the right of each brick and below it, in its plane; -1 if there is none."""
+        return reader.neighbours(self.columns.numpy(), list(map(vars, self.mpis)))
+
     def optical_depth(self, k: int, codes: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """tau of head k from interpolated codes."""
         raw = self.density_codes.low + self.density_codes.step * codes
@@ -114,36 +124,8 @@ def tiles_of(mpi: MPIPlan) -> tuple[int, int, int]:
     return -(-mpi.planes // WORD), -(-(mpi.height - 1) // CELLS), -(-(mpi.width - 1) // CELLS)
 
 
-def brick_numbers(columns: Int[Tensor, "N 2"], mpis: Sequence[MPIPlan]) -> Iterator[Int[Tensor, "P Y X"]]:
-    """Brick of every tile of each MPI from the columns of all; -1 if it is empty."""
-    bits = bits_of(columns[:, 0])
-    numbers = torch.where(bits > 0, columns[:, 1:] + bits.cumsum(1) - bits, -1)
-    for mpi, columns_here in zip(mpis, numbers.split([math.prod(tiles_of(m)) for m in mpis]), strict=True):
-        words, down, across = tiles_of(mpi)
-        yield columns_here.view(words, down, across, WORD).permute(0, 3, 1, 2).reshape(-1, down, across)[: mpi.planes]
-
-
-def neighbours(columns: Int[Tensor, "N 2"], mpis: tuple[MPIPlan, ...], count: int) -> Int[Tensor, "2 B"]:
-    """The bricks to the right of each brick and below it, in its plane; -1 if there is none."""
-    bricks = torch.full((2, count), -1)
-    for numbers in brick_numbers(columns, mpis):
-        numbers = numbers.to(torch.int64)
-        beside = torch.nn.functional.pad(numbers, (0, 1, 0, 1), value=-1)
-        bricks[:, numbers[numbers >= 0]] = torch.stack([beside[:, :-1, 1:], beside[:, 1:, :-1]])[:, numbers >= 0]
-    return bricks
-
-
-def take_borders(codes: Shaped[Tensor, "B 8 8 ..."], beside: Int[Tensor, "2 B"]) -> None:
-    """Copies the shared texels of the bricks to the right and below into the last column and row of each brick."""
-    (right, has_right), (below, has_below) = ((x.clamp(min=0), x >= 0) for x in beside)
-    codes[has_right, :CELLS, CELLS] = codes[right[has_right], :CELLS, 0]
-    codes[has_below, CELLS] = codes[below[has_below], 0]
-    alone = has_right & ~has_below
-    codes[alone, CELLS, CELLS] = codes[right[alone], CELLS, 0]
-
-
-def most_of_copies(values: Float[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]) -> Float[Tensor, "B 8 8"]:
+def most_of_copies(values: Float[Tensor, "B 8 8"], beside: Int[np.ndarray, "2 B"]) -> Float[Tensor, "B 8 8"]:
     """The largest value among the bricks that share each texel; values are not negative."""
     texels = torch.arange(values.numel()).view(values.shape)
-    take_borders(texels, beside)
+    reader.take_borders(texels.numpy(), beside)
     return torch.zeros(values.numel()).scatter_reduce_(0, texels.flatten(), values.flatten(), "amax")[texels]

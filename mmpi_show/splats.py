@@ -24,7 +24,7 @@ from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order, torch_apart
 from mmpi_show.files import Pose
 from mmpi_show.ops.splat import BLUR, Gaussians, View, splat_errors, splat_image
-from mmpi_show.scene import CELLS, SIDE, brick_numbers
+from mmpi_show.scene import CELLS, SIDE
 from mmpi_show.windows import BakedWindow
 
 WIDTH = 0.35
@@ -188,7 +188,7 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
     mpis, keys, steps = window.mpis, torch.full(peaks.shape, -1), torch.arange(SIDE)
     sizes = torch.tensor([[m.planes, m.height, m.width] for m in mpis.mpis])
     starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.prod(1).cumsum(0)])
-    for k, (mpi, numbers) in enumerate(zip(mpis.mpis, brick_numbers(mpis.columns, mpis.mpis), strict=True)):
+    for k, (mpi, numbers) in enumerate(zip(mpis.mpis, mpis.brick_numbers(), strict=True)):
         plane, row, column = ((numbers >= 0).nonzero()).unbind(-1)
         y, x = (row * CELLS)[:, None, None] + steps[:, None], (column * CELLS)[:, None, None] + steps
         key = (plane[:, None, None] * mpi.height + y) * mpi.width + x + starts[k]

@@ -24,7 +24,7 @@ from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
 from mmpi_show.ops.baked import render_baked
-from mmpi_show.scene import CELLS, MOST_CHANNELS, SIDE, BakedMpis, Codes, Shader, brick_numbers
+from mmpi_show.scene import CELLS, MOST_CHANNELS, SIDE, BakedMpis, Codes, Shader
 
 THINNEST = -12.0
 """Lower bound on the raw density of code 0; its softplus is 6e-6."""
@@ -103,7 +103,7 @@ class BakedWindow:
     def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:
         """The same window with only some of the bricks."""
         mpis, columns, first = self.mpis, [], 0
-        for numbers in brick_numbers(mpis.columns, mpis.mpis):
+        for numbers in mpis.brick_numbers():
             columns_here, places = columns_from((numbers >= 0) & kept[numbers.clamp(min=0)], first)
             columns.append(columns_here)
             first += len(places)

@@ -15,7 +15,8 @@ from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window
 from mmpi_show.files import BakedScene, Pose
-from mmpi_show.scene import BakedMpis, Codes, Shader, neighbours, take_borders, tiles_of
+from mmpi_show.reader import neighbours, take_borders
+from mmpi_show.scene import BakedMpis, Codes, Shader, tiles_of
 from mmpi_show.windows import BakedWindow
 
 
@@ -31,9 +32,9 @@ def random_window(num_mpis=2, seed=0, planes=40, channels=5, stored=0.5, density
         count += len(places)
     codes = torch.randint(density[0], density[1] + 1, (count, 8, 8), generator=g, dtype=torch.uint8)
     texels = torch.randint(0, 256, (count, 8, 8, channels), generator=g, dtype=torch.uint8)
-    beside = neighbours(torch.cat(columns), mpis, count)
+    beside = neighbours(torch.cat(columns).numpy(), list(map(vars, mpis)))
     for table in (codes, texels):
-        take_borders(table, beside)
+        take_borders(table.numpy(), beside)
     intervals = tuple(rng.uniform(*shares) for _ in mpis)
     ranges = (*[Codes.spanning(-4, 4)] * 3, *[Codes.spanning(-1.5, 1.1)] * (channels - 3))
     baked = BakedMpis(mpis, intervals, torch.cat(columns), codes, texels, Codes.spanning(-12, 4), ranges)

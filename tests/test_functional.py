@@ -20,7 +20,7 @@ import mmpi_ns
 import mmpi_show
 from mmpi_ns.utils.errors import InputError
 from mmpi_show.files import HEADER, read_baked, write_baked
-from mmpi_show.ops.baked.reader import camera_rays
+from mmpi_show.reader import camera_rays
 
 ROOT = Path(__file__).parents[1]
 

@@ -12,9 +12,9 @@ from random_bricks import random_window, rays_into, scene_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import Rays
 from mmpi_ns.scene.columns import columns_from
+from mmpi_show import reader
 from mmpi_show.files import write_baked
-from mmpi_show.ops.baked import reader
-from mmpi_show.scene import SIDE, Shader, brick_numbers
+from mmpi_show.scene import SIDE, Shader
 
 FORMS = ("reference", "cpu")
 
@@ -107,7 +107,7 @@ def test_peaks_are_the_largest_weights(form):
 def test_columns_find_every_brick():
     """Numbers and places of bricks survive the way through columns, beyond 32 planes and with the sign bit set."""
     window = random_window(num_mpis=1, planes=65, stored=0.7)
-    (numbers,) = brick_numbers(window.mpis.columns, window.mpis.mpis)
+    (numbers,) = window.mpis.brick_numbers()
     assert sorted(numbers[numbers >= 0].tolist()) == list(range(window.mpis.num_bricks))
     columns, places = columns_from(numbers >= 0, 0)
     assert torch.equal(columns, window.mpis.columns) and len(columns) == window.mpis.first_column(1)

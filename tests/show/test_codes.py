@@ -11,7 +11,8 @@ import torch
 from random_bricks import random_window
 
 from mmpi_show.codes import smoothed_codes
-from mmpi_show.scene import CELLS, brick_numbers, most_of_copies, neighbours, take_borders
+from mmpi_show.reader import take_borders
+from mmpi_show.scene import CELLS, most_of_copies
 
 
 def rough_window():
@@ -21,8 +22,8 @@ def rough_window():
     smooth = 120 + 90 * (waves[:, None] * torch.randn(mpis.num_bricks, 1, 8, generator=g)).tanh()
     noise = torch.randint(-9, 10, mpis.texels.shape, generator=g) * (torch.rand(mpis.texels.shape, generator=g) < 0.3)
     codes = (smooth[..., None] + noise).clamp(0, 255).to(torch.uint8)
-    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
-    take_borders(codes, beside)
+    beside = mpis.neighbours()
+    take_borders(codes.numpy(), beside)
     slack = (12 * torch.randn(codes.shape[:3], generator=g)).clamp(0, 255).to(torch.uint8)
     slack[::7], slack[::5] = 0, 255
     return replace(window, mpis=replace(mpis, texels=codes)), slack, beside
@@ -51,7 +52,7 @@ def test_a_code_is_exact_or_expected_and_within_its_slack():
             assert abs(code - exact) <= allowed
             settled += off
     again = smooth.clone()
-    take_borders(again, beside)
+    take_borders(again.numpy(), beside)
     assert torch.equal(again, smooth)
     assert 0.3 < settled / codes.numel() < 0.7
     assert torch.equal(smoothed_codes(codes, torch.zeros_like(slack), beside), codes)
@@ -62,9 +63,9 @@ def test_copies_of_a_texel_have_the_largest_value_of_them(stored):
     """By the place of each texel in its plane; bricks that touch at a corner alone keep a value each."""
     window = random_window(seed=1, stored=stored)
     mpis, values = window.mpis, torch.rand(window.mpis.density.shape, generator=torch.Generator().manual_seed(2))
-    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    beside = mpis.neighbours()
     most = most_of_copies(values, beside)
-    for numbers in brick_numbers(mpis.columns, mpis.mpis):
+    for numbers in mpis.brick_numbers():
         copies: dict[tuple[int, ...], list[tuple[int, int, int]]] = {}
         for (plane, row, column), number in np.ndenumerate(numbers.numpy()):
             for y, x in itertools.product(range(8), range(8)) if number >= 0 else ():
@@ -74,5 +75,5 @@ def test_copies_of_a_texel_have_the_largest_value_of_them(stored):
             assert all(float(values[texel]) <= float(most[texel]) <= largest for texel in texels)
             assert stored < 1 or all(float(most[texel]) == largest for texel in texels)
     agreeing = most.clone()
-    take_borders(agreeing, beside)
+    take_borders(agreeing.numpy(), beside)
     assert torch.equal(agreeing, most)

@@ -19,8 +19,7 @@ import mmpi_show
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.viewer import CapturedPath
 from mmpi_show.files import HEADER, read_baked, write_baked
-from mmpi_show.ops.baked.reader import camera_rays
-from mmpi_show.scene import neighbours, take_borders
+from mmpi_show.reader import camera_rays, take_borders
 from mmpi_show.web import write_page
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with (apt-get install chromium)")
@@ -37,7 +36,7 @@ def smooth_window(seed, **settings):
     window = random_window(seed=seed, density=(120, 200), **settings)
     for table in (window.mpis.density, window.mpis.texels):
         table[:] = table[:, :1, :1]
-        take_borders(table, neighbours(window.mpis.columns, window.mpis.mpis, window.mpis.num_bricks))
+        take_borders(table.numpy(), window.mpis.neighbours())
     return window
 
 

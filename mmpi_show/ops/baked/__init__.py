@@ -1,4 +1,4 @@
-"""Rays through baked multi-plane images, front to back until they are opaque; defined by ``reader.py``, in float64."""
+"""Rays through baked multi-plane images, front to back until they are opaque, as ``mmpi_show/reader.py`` in float64."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.layout import dense, dense_fields, frame_rows
 from mmpi_ns.ops.march import RayOutputs, Rays, ray_outputs
 from mmpi_ns.scene.geometry import Frames
+from mmpi_show import reader
 from mmpi_show.ops import OPS
-from mmpi_show.ops.baked import reader
 from mmpi_show.scene import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, tiles_of
 
 

@@ -1,6 +1,6 @@
-"""A reader of baked scenes in plain NumPy: the format and its rendering (docs/export.md) in under two hundred lines.
+"""A reader of baked scenes in plain NumPy: the format and its rendering (docs/export.md) in two hundred lines.
 
-    python mmpi_show/ops/baked/reader.py FOLDER NUMBER image.npy      # renders camera NUMBER of the path
+    python mmpi_show/reader.py FOLDER NUMBER image.npy      # renders camera NUMBER of the path
 
 Float64, every plane of every MPI, without other code of this package: an example for other viewers, the reference of
 the tests, and the form that runs where there is no compiler.
@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,31 +66,42 @@ def decode(window: Window) -> np.ndarray:
     codes[:, :, ::2, 1::2] += ((even + even[..., after]) // 2).astype(np.uint8)
     even = codes[:, :, ::2].astype(np.uint16)
     codes[:, :, 1::2] += ((even + even[:, :, after]) // 2).astype(np.uint8)
-    take_borders(window, codes)
+    beside = neighbours(window["columns_array"], window["mpis"])
+    for channel in codes:
+        take_borders(channel, beside)
     return codes.reshape(*codes.shape[:2], 64)
 
 
-def brick_numbers(window: Window, mpi: dict[str, Any]) -> np.ndarray:
-    """Brick of every tile [planes, rows, columns] of an MPI; -1 where it is empty."""
-    rows, columns, words = -(-(mpi["height"] - 1) // 7), -(-(mpi["width"] - 1) // 7), -(-mpi["planes"] // 32)
-    first = mpi["first_column"]
-    bits, start = np.moveaxis(window["columns_array"][first : first + words * rows * columns].astype(np.int64), 1, 0)
-    bits, start = (x.reshape(words, 1, rows, columns) for x in (bits, start))
-    stored = bits >> np.arange(32)[:, None, None] & 1
-    numbers = np.where(stored, start + stored.cumsum(1) - stored, -1)
-    return numbers.reshape(-1, rows, columns)[: mpi["planes"]]
+def brick_numbers(columns: np.ndarray, mpis: list[dict[str, Any]]) -> Iterator[np.ndarray]:
+    """Brick of every tile [planes, rows, columns] of each MPI, from the columns [N, 2] of all; -1 where it is empty."""
+    first = 0
+    for mpi in mpis:
+        shape = -(-mpi["planes"] // 32), 1, -(-(mpi["height"] - 1) // 7), -(-(mpi["width"] - 1) // 7)
+        columns_here = columns[first : first + math.prod(shape)].astype(np.int64)
+        first += len(columns_here)
+        bits, start = columns_here.T.reshape(2, *shape)
+        stored = bits >> np.arange(32)[:, None, None] & 1
+        numbers = np.where(stored, start + stored.cumsum(1) - stored, -1)
+        yield numbers.reshape(-1, *shape[2:])[: mpi["planes"]]
 
 
-def take_borders(window: Window, codes: np.ndarray) -> None:
-    """The last column and row of a brick [..., B, 8, 8] are the first ones of its neighbours, if there are any."""
-    for mpi in window["mpis"]:
-        numbers = np.pad(brick_numbers(window, mpi), ((0, 0), (0, 1), (0, 1)), constant_values=-1)
-        bricks = np.stack([numbers[:, :-1, :-1], numbers[:, :-1, 1:], numbers[:, 1:, :-1]], -1).reshape(-1, 3)
-        brick, right, below = bricks[bricks[:, 0] >= 0].T
-        beside, under, alone = right >= 0, below >= 0, (right >= 0) & (below < 0)
-        codes[:, brick[beside], :7, 7] = codes[:, right[beside], :7, 0]
-        codes[:, brick[under], 7] = codes[:, below[under], 0]
-        codes[:, brick[alone], 7, 7] = codes[:, right[alone], 7, 0]
+def neighbours(columns: np.ndarray, mpis: list[dict[str, Any]]) -> np.ndarray:
+    """The bricks to the right of each brick and below it [2, B], in its plane; -1 if there is none."""
+    numbers = list(brick_numbers(columns, mpis))
+    bricks = np.full((2, sum(int((n >= 0).sum()) for n in numbers)), -1)
+    for here in numbers:
+        beside = np.pad(here, ((0, 0), (0, 1), (0, 1)), constant_values=-1)
+        bricks[:, here[here >= 0]] = np.stack([beside[:, :-1, 1:], beside[:, 1:, :-1]])[:, here >= 0]
+    return bricks
+
+
+def take_borders(codes: np.ndarray, beside: np.ndarray) -> None:
+    """The last column and row of a brick [B, 8, 8, ...] become the first ones of its neighbours, if there are any."""
+    right, below = beside
+    has_right, has_below, alone = right >= 0, below >= 0, (right >= 0) & (below < 0)
+    codes[has_right, :7, 7] = codes[right[has_right], :7, 0]
+    codes[has_below, 7] = codes[below[has_below], 0]
+    codes[alone, 7, 7] = codes[right[alone], 7, 0]
 
 
 def camera_rays(pose: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -103,10 +116,11 @@ def camera_rays(pose: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(to_world[:, 3], directions.shape), directions / np.linalg.norm(directions, axis=-1)[:, None]
 
 
-def _cross(window: Window, mpi: dict[str, Any], rays: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+def _cross(
+    window: Window, mpi: dict[str, Any], numbers: np.ndarray, rays: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, ...]:
     """1 / distance and optical depth [R, P], texels and their shares [R, P, 4] where rays intersect an MPI's planes."""
-    origins, directions, near, far = rays
-    axes, numbers = np.array(mpi["axes"]), brick_numbers(window, mpi)
+    (origins, directions, near, far), axes = rays, np.array(mpi["axes"])
     (ox, oy, oz), (dx, dy, dz) = (
         np.moveaxis((axes * x[:, None, :]).sum(-1), 1, 0)[..., None] for x in (origins - mpi["origin"], directions)
     )
@@ -144,7 +158,8 @@ def march(
 ) -> Samples:
     """The samples of rays [R, 3] between distances near (the window's, if None) and far [R, 1]."""
     rays = (origins, directions, np.array(window["ray_near"]) if near is None else near, np.array(far))
-    parts = [_cross(window, mpi, rays) for mpi in window["mpis"]]
+    numbers = brick_numbers(window["columns_array"], window["mpis"])
+    parts = [_cross(window, *mpi, rays) for mpi in zip(window["mpis"], numbers, strict=True)]
     inverse_t, tau, texels, shares = (np.concatenate(x, 1) for x in zip(*parts, strict=True))
     order = np.argsort(-inverse_t, axis=1, kind="stable")
     mpis = np.repeat(np.arange(len(parts)), [part[0].shape[1] for part in parts])[order]
