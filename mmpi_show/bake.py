@@ -16,11 +16,9 @@ from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.functional import read_run_config
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.rendering.metrics import ImageMetrics, psnr
-from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.parallel import in_order, torch_apart
 from mmpi_show.codes import smoothed_codes
@@ -48,13 +46,6 @@ def load_model(load_config: Path, details: bool = False) -> Any:
     return pipeline
 
 
-def bake_of_model(model: MMPIModel, field: MMPIField) -> BakedWindow:
-    """A window of a model, baked. Raises ValueError with the reason if it cannot be baked."""
-    rendering, mean = model.config.rendering, model.exposures.mean
-    exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
-    return bake(field, rendering.threshold, BACKGROUNDS[rendering.background], field.blends, exposure)
-
-
 @torch_apart()
 def bake_run(pipeline: Any, least: float) -> BakedScene:
     """All windows of a finished run, baked, and the details that its model has.
@@ -79,7 +70,7 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
-        whole = bake_of_model(model, field)
+        whole = bake(model, field)
         cameras_here = (shares[:, number] > 0).nonzero()[:, 0].tolist()
         step = math.ceil((float((cameras.width * cameras.height)[cameras_here].sum()) / MOST_LOOKED_AT) ** 0.5)
         alike = sorted(cameras_here, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])

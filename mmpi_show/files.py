@@ -201,7 +201,7 @@ def _arrays(window: BakedWindow, behind: int) -> dict[str, NDArray[Any]]:
     coarse, fine = map(np.stack, zip(*in_order(lambda channel: split_codes(channel, beside), channels), strict=True))
     network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
     others = {
-        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
+        "network": torch.cat(network).numpy(),
         "columns": mpis.columns[:, 0].numpy().view(np.uint32),
     }
     beside_bricks = sum(len(_gzip(array)) for array in others.values())  # the first part has columns too
@@ -230,17 +230,34 @@ def _gzip(array: NDArray[Any]) -> bytes:
 
 
 def read_baked(folder: Path) -> BakedScene:
-    """A scene that ``write_baked`` wrote. Raises ValueError with the remedy if it is missing, damaged or of another
-    version."""
-    header = read_header(folder)
+    """A scene that ``write_baked`` wrote.
+
+    Raises:
+        InputError: there is none.
+        ValueError: it is damaged or of another version; the message says which file, and the remedy.
+    """
+    path = folder / HEADER
+    if not path.is_file():
+        raise InputError(
+            f"There is no baked scene at {folder}: give a folder that mmpi-export bake or mmpi-export web wrote (with "
+            f"{HEADER}). Runs are read by mmpi_ns.load."
+        )
     try:
+        header = json.loads(path.read_text(encoding="utf-8"))
+        if header["format"] != FORMAT:
+            raise ValueError(f"{path} is not the header of a baked scene: give the folder that mmpi-export bake wrote.")
+        if header["version"] != VERSION:
+            raise ValueError(
+                f"{path} is of version {header['version']}, and this program reads version {VERSION}: use the program "
+                "that wrote it, or bake the scene again."
+            )
         windows, views = zip(*(_read_window(folder, row) for row in header["windows"]), strict=True)
         nearest = 0 if header["details"] is None else header["details"]["nearest"]
         vectors = ("size", "focal", "center")
-        path = [Pose(p["to_world"], *(tuple(p[v]) for v in vectors), test=p["test"]) for p in header["path"]]
-        return BakedScene(header["name"], tuple(header["up"]), path, list(windows), sum(views, ()), nearest)
-    except (KeyError, TypeError, InputError) as error:
-        raise ValueError(f"{folder / HEADER} is damaged ({error!r}): bake the scene again.") from error
+        cameras = [Pose(p["to_world"], *(tuple(p[v]) for v in vectors), test=p["test"]) for p in header["path"]]
+        return BakedScene(header["name"], tuple(header["up"]), cameras, list(windows), sum(views, ()), nearest)
+    except (KeyError, TypeError, InputError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is damaged ({error!r}): bake the scene again.") from error
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> Scene:
@@ -252,39 +269,14 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Scene:
         device: where images are moved; they are rendered on the CPU.
 
     Raises:
-        InputError: there is no scene.
-        ValueError: its files are damaged; the message names the file and the remedy.
+        InputError, ValueError: as ``read_baked``.
     """
-    if not (Path(path) / HEADER).is_file():
-        raise InputError(
-            f"There is no baked scene at {path}: give a folder that mmpi-export bake or mmpi-export web wrote (with "
-            f"{HEADER}). Runs are read by mmpi_ns.load."
-        )
     baked = read_baked(Path(path))
     cameras = torch.tensor([[*chain(*pose.to_world), *pose.focal, *pose.center, *pose.size] for pose in baked.path])
     names = WindowedPlan(tuple(place for place, _ in baked.windows)).names
     return Scene(
         names, CameraPath.of(cameras), torch.device(device), lambda camera: baked.image(image_rays(camera.to("cpu")))
     )
-
-
-def read_header(folder: Path) -> dict[str, Any]:
-    """The header of a baked scene. Raises ValueError as ``read_baked``."""
-    path = folder / HEADER
-    if not path.is_file():
-        raise ValueError(f"There is no baked scene in {folder} ({HEADER} is missing): make one with mmpi-export bake.")
-    try:
-        header = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is damaged ({error}): bake the scene again.") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"{path} is not the header of a baked scene: give the folder that mmpi-export bake wrote.")
-    if header.get("version") != VERSION:
-        raise ValueError(
-            f"{path} is of version {header.get('version')}, and this program reads version {VERSION}: use the program "
-            "that wrote it, or bake the scene again."
-        )
-    return header
 
 
 def _read_window(folder: Path, row: dict[str, Any]) -> tuple[tuple[Window, BakedWindow], tuple[StoredView, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from mmpi_ns.ops import ends
 from mmpi_ns.ops.details import TEXT as WEIGHTS
 from mmpi_ns.rendering.details import MAX_ANGLE
 from mmpi_ns.utils.files import write_atomically
-from mmpi_show.files import HEADER, read_header
+from mmpi_show.files import HEADER
 
 PAGE = Path(__file__).parent / "page"
 
@@ -18,15 +19,15 @@ PAGE = Path(__file__).parent / "page"
 def write_page(folder: Path, single_file: Path | None = None) -> Path:
     """Writes the page of a baked scene into its folder, or one file that contains it and opens by a double click.
 
-    Returns the file. Raises ValueError if the scene is missing or of another version, OSError if the disk is full.
+    Returns the file. Raises OSError if the scene is missing or the disk is full.
     """
-    header, path = read_header(folder), single_file or folder / "index.html"
+    path = single_file or folder / "index.html"
     first, rest, last = [], [], []
     if single_file is not None:
         block = '<script type="{}" id="{}">{}</script>'
-        text = (folder / HEADER).read_text(encoding="utf-8").replace("<", "\\u003c")
-        first.append(block.format("application/json", HEADER, text))
-        for row in header["windows"]:
+        text = (folder / HEADER).read_text(encoding="utf-8")
+        first.append(block.format("application/json", HEADER, text.replace("<", "\\u003c")))
+        for row in json.loads(text)["windows"]:
             data, kind = (folder / row["file"]).read_bytes(), "application/octet-stream"
             ends_of_parts = (0, row["first_bytes"], row["bricks_bytes"], row["bytes"])
             parts = [base64.b64encode(data[begin:end]).decode() for begin, end in pairwise(ends_of_parts)]

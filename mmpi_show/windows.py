@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,12 +20,16 @@ from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.march import Rays
+from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.columns import columns_from
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
 from mmpi_show.ops.baked import render_baked
 from mmpi_show.scene import CELLS, MOST_CHANNELS, SIDE, BakedMpis, Codes, Shader
+
+if TYPE_CHECKING:
+    from mmpi_ns.model import MMPIModel
 
 THINNEST = -12.0
 """Lower bound on the raw density of code 0; its softplus is 6e-6."""
@@ -55,49 +60,36 @@ class BakedWindow:
     seen: Float[Tensor, "B"] | None = None
     """Sum of the largest weights of each brick's texels in training views; None: not computed."""
 
-    def render(
-        self,
-        origins: Float[Tensor, "R 3"],
-        directions: Float[Tensor, "R 3"],
-        bounds: tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]] | None = None,
-        background: Float[Tensor, "3"] | None = None,
-    ) -> dict[str, Tensor]:
+    def render(self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> dict[str, Tensor]:
         """rgb, accumulation, depth, winning MPI and dropped mass of rays, like those of the model.
 
-        Bricks are read on the CPU; the outputs lie where the rays do.
-
         Args:
-            origins: of the rays.
+            origins: of the rays, on the CPU.
             directions: of the rays, unit vectors.
-            bounds: nears and fars of the rays; None: from ``ray_near`` to infinity.
-            background: colour of the background; None: the window's.
         """
-        rays = Rays(*(x.cpu() for x in (origins, directions, *(bounds or self.unbounded(origins)))))
-        marched = render_baked(self.mpis, rays, self.threshold)
-        shaded = self.shader.shade(marched.gathered, marched.mass, rays.directions)
+        marched = render_baked(self.mpis, self.rays(origins, directions), self.threshold)
+        shaded = self.shader.shade(marched.gathered, marched.mass, directions)
         rgb = torch.where(marched.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
-        behind = self.background if background is None else background.cpu()
-        outputs = {
-            "rgb": (rgb * marched.accumulation + behind * marched.transmittance).clamp(0, 1),
+        return {
+            "rgb": (rgb * marched.accumulation + self.background * marched.transmittance).clamp(0, 1),
             "accumulation": marched.accumulation,
             "depth": 1 / marched.inverse_t.clamp(min=1 / self.farthest),
             "winning_mpi": marched.winner,
             "dropped_mass": marched.dropped_mass,
         }
-        return {name: values.to(origins.device) for name, values in outputs.items()}
 
-    def unbounded(self, origins: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
-        """Nears and fars of unbounded rays."""
+    def rays(self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> Rays:
+        """Rays from ``ray_near`` to infinity."""
         nears = torch.full_like(origins[:, :1], self.ray_near)
-        return nears, torch.full_like(nears, torch.inf)
+        return Rays(origins, directions, nears, torch.full_like(nears, torch.inf))
 
     def peaks(self, views: Iterable[tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]) -> Float[Tensor, "B 8 8"]:
         """Largest weight of each texel among the samples of some views, given by origins and unit directions of their
         rays."""
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
-            for o, d in zip(*(x.split(AT_ONCE) for x in view), strict=True):
-                render_baked(self.mpis, Rays(o, d, *self.unbounded(o)), self.threshold, peaks)
+            for part in zip(*(x.split(AT_ONCE) for x in view), strict=True):
+                render_baked(self.mpis, self.rays(*part), self.threshold, peaks)
         return peaks
 
     def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:
@@ -112,69 +104,56 @@ class BakedWindow:
         return replace(self, mpis=replace(mpis, **tables, packed={}), seen=seen)
 
 
-def why_not_baked(model_field: MMPIField) -> str:
-    """Reason why a field cannot be baked, with the remedy; empty if it can."""
-    if not isinstance(model_field.networks, RayShader):
-        return (
-            "A model whose samples are coloured one by one cannot be baked: train with "
-            "--pipeline.model.colour.shading ray."
-        )
-    if model_field.plan.cube is not None:
-        return "A model with a cube cannot be baked: train one of MPIs alone (placement.cube-voxels 0)."
-    channels = model_field.feature_channels
-    if channels > MOST_CHANNELS:
-        return f"A model of {channels} channels a texel cannot be baked: {MOST_CHANNELS} is the most."
-    return ""
-
-
 @torch.no_grad()
-def bake(
-    model_field: MMPIField, threshold: float, background: float, blends: bool, exposure: tuple[float, ...]
-) -> BakedWindow:
-    """A field as bricks of 8-bit codes: all that are not empty.
+def bake(model: MMPIModel, field: MMPIField) -> BakedWindow:
+    """A window of a model as bricks of 8-bit codes: all that are not empty.
 
     Args:
-        model_field: what to bake.
-        threshold: weight below which samples are not shaded.
-        background: grey level of the background.
-        blends: texels store optical depths blended by reliability.
-        exposure: of images, relative to the field's.
+        model: with the settings of rendering, and the exposures of its training images.
+        field: of the window.
 
     Raises:
         ValueError: the field has a cube, too many channels, or a network for every sample.
     """
-    if refusal := why_not_baked(model_field):
-        raise ValueError(refusal)
-    plan, network = model_field.plan, model_field.networks
-    assert isinstance(network, RayShader)
-    shares, heads = bake_shares(model_field) if blends else None, range(len(plan.mpis))
-    reached = [_reached(grid) for grid in model_field.grids[: len(heads)]]
-    parts = [(k, part) for k in heads for part in reached[k].nonzero().split(AT_ONCE_BRICKS)]
-    highest = max((float(_raw(model_field, k, part, shares).max()) for k, part in parts), default=THINNEST)
+    plan, network, grids = field.plan, field.networks, field.grids
+    if not isinstance(network, RayShader):
+        raise ValueError(
+            "A model whose samples are coloured one by one cannot be baked: train with "
+            "--pipeline.model.colour.shading ray."
+        )
+    if plan.cube is not None:
+        raise ValueError("A model with a cube cannot be baked: train one of MPIs alone (placement.cube-voxels 0).")
+    if (count := field.feature_channels) > MOST_CHANNELS:
+        raise ValueError(f"A model of {count} channels a texel cannot be baked: {MOST_CHANNELS} is the most.")
+    shares = bake_shares(field) if field.blends else None
+    reached = [_reached(grid) for grid in grids]
+    parts = [(k, part) for k, tiles in enumerate(reached) for part in tiles.nonzero().split(AT_ONCE_BRICKS)]
+    highest = max((float(_raw(field, k, part, shares).max()) for k, part in parts), default=THINNEST)
     density_codes = Codes.spanning(THINNEST, max(highest, THINNEST + 1))
-    features = model_field.features.data
+    for k, part in parts:  # bricks without stored texels are dropped
+        reached[k][tuple(part.T)] = density_codes.encode(_raw(field, k, part, shares)).amax((-1, -2)) > 0
+    features = field.features.data
     most = [HIGHEST_COLOR] * COLORS + [HIGHEST_FEATURE] * (features.shape[1] - COLORS)
     ranges = zip(features.amin(0).tolist(), features.amax(0).tolist(), most, strict=True)
     channels = tuple(Codes.spanning(*each) for each in ranges)
     columns, density, texels, count = [], [], [], 0
-    for k in heads:
-        for part in reached[k].nonzero().split(AT_ONCE_BRICKS):  # bricks without stored texels are dropped
-            codes = density_codes.encode(_raw(model_field, k, part, shares))
-            reached[k][tuple(part.T)] = codes.amax((-1, -2)) > 0
+    for k, grid in enumerate(grids):
         stored, places = columns_from(reached[k], count)
         columns, count = [*columns, stored], count + len(places)
         for part in places.split(AT_ONCE_BRICKS):
-            density.append(density_codes.encode(_raw(model_field, k, part, shares)))
-            rows, exists = _rows(model_field.grids[k], part)
+            density.append(density_codes.encode(_raw(field, k, part, shares)))
+            rows, exists = _rows(grid, part)
             codes = torch.stack([c.encode(features[rows, i]) for i, c in enumerate(channels)], -1)
             texels.append((codes * exists[..., None]).cpu())
     tables = torch.cat(columns), torch.cat(density).contiguous(), torch.cat(texels).contiguous()
-    intervals = tuple(model_field.layout.interval(k) for k in heads)
-    mpis = BakedMpis(plan.mpis, intervals, *tables, density_codes, channels)
+    mpis = BakedMpis(plan.mpis, tuple(map(field.layout.interval, range(len(grids)))), *tables, density_codes, channels)
     numbers = [x.detach().cpu() for x in network.layers(0)]
     numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
     shader = Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.frequencies[0], MOST_CHANGE)
-    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, plan.farthest, exposure)
+    rendering, mean = model.config.rendering, model.exposures.mean
+    exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
+    background = BACKGROUNDS[rendering.background]
+    return BakedWindow(mpis, shader, plan.ray_near, rendering.threshold, background, plan.farthest, exposure)
 
 
 def _reached(grid: TexelGrid) -> Bool[Tensor, "P Y X"]:
@@ -197,18 +176,18 @@ def _rows(grid: TexelGrid, places: Int[Tensor, "B 3"]) -> tuple[Int[Tensor, "B 8
 
 
 def _raw(
-    model_field: MMPIField, k: int, places: Int[Tensor, "B 3"], shares: Float[Tensor, "N 1"] | None
+    field: MMPIField, k: int, places: Int[Tensor, "B 3"], shares: Float[Tensor, "N 1"] | None
 ) -> Float[Tensor, "B 8 8"]:
     """Raw densities including the biases of the planes, whose softplus gives the blended optical depth; those of
     texels that do not exist have code 0."""
-    rows, exists = _rows(model_field.grids[k], places)
-    biases = model_field.layout.biases[k]
-    raw = model_field.density.data[rows, 0] + biases[places[:, 0].to(biases.device), None, None]
+    rows, exists = _rows(field.grids[k], places)
+    biases = field.layout.biases[k]
+    raw = field.density.data[rows, 0] + biases[places[:, 0].to(biases.device), None, None]
     if shares is not None:
-        interval, share = model_field.layout.interval(k), shares[rows, 0].clamp(0, 1)
+        interval, share = field.layout.interval(k), shares[rows, 0].clamp(0, 1)
         tau = torch.nn.functional.softplus(raw) * interval
         blended = blended_optical_depth(tau, share.log(), torch.log1p(-share))
-        tau = torch.where(tau > NEGLIGIBLE, blended, tau / len(model_field.grids)) / interval
+        tau = torch.where(tau > NEGLIGIBLE, blended, tau / len(field.grids)) / interval
         raw = tau + torch.log(-torch.expm1(-tau.clamp(min=1e-12)))
     return torch.where(exists, raw, THINNEST).cpu()
 

@@ -17,8 +17,9 @@ from mmpi_ns.field.shading import RayShader
 from mmpi_ns.rendering.rendered import bounded, render_outputs, winners
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_show import __main__ as export
-from mmpi_show.bake import bake_of_model, bake_run, compare
+from mmpi_show.bake import bake_run, compare
 from mmpi_show.files import read_baked, write_baked
+from mmpi_show.windows import bake
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def outputs(model, how, rays):
         if how == "exact":
             return model.get_outputs(copy.deepcopy(rays))
         bundle, field = bounded(copy.deepcopy(rays), model.field.plan), model.field
-        drawn = bake_of_model(model, field).render(bundle.origins, bundle.directions, (bundle.nears, bundle.fars))
+        drawn = bake(model, field).render(bundle.origins, bundle.directions)
         return drawn | winners(drawn, bundle, field, 0)
 
 
@@ -118,7 +119,7 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path, capsys, monkeypatch):
     model = filled(trainer)
     monkeypatch.setattr("mmpi_show.bake.load_model", lambda *_: trainer.pipeline)
     scene = export.Bake(tmp_path / "config.yml", compare=2).bake()
-    whole, told = bake_of_model(model, model.field), capsys.readouterr().out
+    whole, told = bake(model, model.field), capsys.readouterr().out
     kept = scene.windows[0][1]
     assert 0 < kept.mpis.num_bricks < whole.mpis.num_bricks
     assert "bricks are seen" in told and "dB to the exact renderer's" in told
@@ -136,18 +137,18 @@ def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
     model = filled(trainer)
     monkeypatch.setattr(model.field, "feature_channels", 17)
     with pytest.raises(ValueError, match="16 is the most"):
-        bake_of_model(model, model.field)
+        bake(model, model.field)
     monkeypatch.undo()
     cube = CubePlan((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2, 2, 2))
     monkeypatch.setattr(model.field, "plan", replace(model.field.plan, cube=cube))
     with pytest.raises(ValueError, match="cube"):
-        bake_of_model(model, model.field)
+        bake(model, model.field)
     monkeypatch.undo()
     assert isinstance(model.field.networks, RayShader)
     model.field._modules["networks"] = torch.nn.Linear(1, 1)
     try:
         with pytest.raises(ValueError, match="shading ray"):
-            bake_of_model(model, model.field)
+            bake(model, model.field)
     finally:
         model.field._modules["networks"] = RayShader(1, 4, 8, 2)
 
