@@ -21,8 +21,7 @@ class Details {
     const { gl } = this, texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA8, width, height, layers);
-    for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl[`TEXTURE_${name}`], gl.LINEAR);
-    for (const name of ["WRAP_S", "WRAP_T"]) gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl[`TEXTURE_${name}`], gl.CLAMP_TO_EDGE);
+    setSampling(gl, gl.TEXTURE_2D_ARRAY, gl.LINEAR);
     return texture;
   }
 
@@ -82,9 +81,6 @@ class Details {
     }
     this.pending.delete(view);
   }
-
-  // Whether all images that a camera needs are loaded.
-  ready(camera) { return this.chosen(camera).every(({ view }) => this.layers.includes(view)); }
 
   // Uniforms and textures of a picture, for the program in use; none where it shows the field alone.
   bind(uniform, unit, camera) {

@@ -29,8 +29,8 @@ function between(a, b, t) {
 }
 
 class Page {
-  constructor(gl, header, source) {
-    Object.assign(this, { gl, header, source, mode: 0, alone: null, playing: null, moved: 0, dirty: true });
+  constructor(gl, header) {
+    Object.assign(this, { gl, header, mode: 0, alone: null, playing: null, moved: 0, dirty: true });
     // `alone` is {window, head} of the one MPI to show, or null for all of them.
     this.cost = 1e-5; // seconds a pixel, as the last frame took
     this.keys = new Set();
@@ -59,20 +59,7 @@ class Page {
         this.windows.set(w, window);
       } else {
         this.windows.set(w, null);
-        const row = this.header.windows[w];
-        const told = (part) => {
-          if (!this.failed) report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
-        };
-        const [first, rest, views] = this.source(row, told);
-        try {
-          const window = await WindowOnCard.load(this.gl, row, await first, this.details);
-          this.windows.set(w, window);
-          this.dirty = true;
-          rest.then((bytes) => window.complete(bytes)).then(() => { told(1); this.dirty = true; return views; })
-            .then((bytes) => { if (!window.freed) this.details.add(row, bytes); }).catch((e) => this.fail(e));
-        } catch (error) {
-          this.fail(error);
-        }
+        await this.load(w, this.header.windows[w]).catch((error) => this.fail(error));
       }
     }
     for (const [w, window] of this.windows)
@@ -82,6 +69,20 @@ class Page {
         this.windows.delete(w);
       }
     this.details.feed(this.camera);
+  }
+
+  // Draws a window from the first part of its file on; the rest follows.
+  async load(w, row) {
+    const told = (part) => {
+      if (!this.failed) report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
+    };
+    const parts = partsOf(row, told), [first, rest, views] = Array.from({ length: 3 }, async () => (await parts.next()).value);
+    rest.catch(() => {}); // awaited only once the first part is drawn
+    const window = await WindowOnCard.load(this.gl, row, await first, this.details);
+    this.windows.set(w, window);
+    this.dirty = true;
+    rest.then((bytes) => window.complete(bytes)).then(() => { told(1); this.dirty = true; return views; })
+      .then((bytes) => { if (!window.freed) this.details.add(row, bytes); }).catch((error) => this.fail(error));
   }
 
   fail(error) {
@@ -279,55 +280,51 @@ function decoded(id) {
 
 // Bytes of a window (its first part, the rest of its bricks, and details) from the page itself where they are in it, else
 // from beside it.
-function fetchWindow(row, progress) {
+async function* partsOf(row, progress) {
   if ($(row.file)) {
-    const later = (name) => parsed.then(() => decoded(`${row.file}.${name}`));
-    return [Promise.resolve(decoded(row.file)), later("rest"), later("details")];
+    yield decoded(row.file);
+    await parsed;
+    yield decoded(`${row.file}.rest`);
+    yield decoded(`${row.file}.details`);
+    return;
   }
-  const parts = [row.first_bytes, row.bricks_bytes, row.bytes].map((end) => {
-    const part = { end };
-    part.bytes = new Promise((resolve, reject) => Object.assign(part, { resolve, reject }));
-    part.bytes.catch(() => {}); // the first one tells
-    return part;
-  });
-  readWindow(row, progress, parts).catch((error) => parts.forEach((part) => part.reject(error)));
-  return parts.map((part) => part.bytes);
-}
-
-async function readWindow(row, progress, parts) {
   const response = await fetch(row.file, { cache: "no-cache" });
   if (!response.ok) throw new Refusal(`${row.file} is missing beside this page: copy the whole folder.`);
   const reader = response.body.getReader(), bytes = new Uint8Array(row.bytes);
-  let at = 0;
-  for (;;) {
-    const { done, value } = await reader.read();
-    if (done) break;
-    if (at + value.length > row.bytes) throw new Refusal(`${row.file} is longer than scene.json says: copy the folder anew.`);
-    bytes.set(value, at);
-    at += value.length;
-    parts.forEach(({ end, resolve }, i) => { if (at >= end && end < row.bytes) resolve(bytes.subarray(i && parts[i - 1].end, end)); });
-    if (at < row.bricks_bytes) progress(at / row.bricks_bytes);
+  let at = 0, begin = 0;
+  for (const end of [row.first_bytes, row.bricks_bytes, row.bytes]) {
+    while (at < end) {
+      const { done, value } = await reader.read();
+      if (done || at + value.length > row.bytes)
+        throw new Refusal(`${row.file} is cut short or too long (${row.bytes} bytes are right): copy the whole folder anew.`);
+      bytes.set(value, at);
+      at += value.length;
+      if (at < row.bricks_bytes) progress(at / row.bricks_bytes);
+    }
+    yield bytes.subarray(begin, end);
+    begin = end;
   }
-  if (at < row.bytes) throw new Refusal(`${row.file} is cut short (${at} of ${row.bytes} bytes): copy it anew.`);
-  parts.forEach(({ end, resolve }, i) => resolve(bytes.subarray(i && parts[i - 1].end, end)));
 }
 
 async function fetchHeader() {
   const inside = $("scene.json");
-  if (inside) return JSON.parse(inside.textContent);
-  if (location.protocol === "file:")
+  if (!inside && location.protocol === "file:")
     throw new Refusal("A browser does not read files beside a page that was opened from the disk: serve this folder " +
       "(python -m http.server), or export one file with mmpi-export web --single-file.");
-  const response = await fetch("scene.json", { cache: "no-cache" });
+  const response = inside ? new Response(inside.textContent) : await fetch("scene.json", { cache: "no-cache" });
   if (!response.ok) throw new Refusal("scene.json is missing beside this page: copy the whole folder.");
-  return response.json().catch(() => { throw new Refusal("scene.json is damaged: copy it anew, or export the scene again."); });
+  const header = await response.json().catch(() => { throw new Refusal("scene.json is damaged: copy it anew, or export the scene again."); });
+  if (header.format !== "mmpi-baked") throw new Refusal("scene.json is not the header of a baked scene.");
+  if (header.version !== 5)
+    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 5: export it again.`);
+  return header;
 }
 
 async function main() {
   const gl = $("view").getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
   if (!gl) throw new Refusal("This browser has no WebGL2, which this page draws with: switch on hardware acceleration, or try another browser.");
   if (typeof DecompressionStream === "undefined") throw new Refusal("This browser is too old to unpack the scene: any of 2023 or newer can.");
-  const page = new Page(gl, checkHeader(await fetchHeader()), fetchWindow);
+  const page = new Page(gl, await fetchHeader());
   document.title = page.header.name;
   window.mmpi = page; // for tests and tinkering
   await page.feed();

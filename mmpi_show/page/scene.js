@@ -10,10 +10,8 @@ async function unpack(bytes, spec, from = 0) {
   const part = bytes.subarray(spec.offset - from, spec.offset - from + spec.bytes);
   try {
     const stream = new Blob([part]).stream().pipeThrough(new DecompressionStream("gzip"));
-    const data = await new Response(stream).arrayBuffer();
-    const size = { uint8: 1, uint32: 4, float16: 2 }[spec.type];
-    if (data.byteLength !== size * spec.shape.reduce((a, b) => a * b, 1)) throw new Error("wrong length");
-    return new { uint8: Uint8Array, uint32: Uint32Array, float16: Uint16Array }[spec.type](data);
+    const data = await new Response(stream).arrayBuffer(), type = { uint8: Uint8Array, uint32: Uint32Array, float16: Uint16Array }[spec.type];
+    return new type(data, 0, spec.shape.reduce((a, b) => a * b, 1));
   } catch (error) {
     throw new Refusal(`A file of this scene is damaged (${error.message}): copy it anew, or export the scene again.`);
   }
@@ -106,28 +104,6 @@ function halves(data) {
   });
 }
 
-function checkHeader(header) {
-  if (!header || header.format !== "mmpi-baked") throw new Refusal("scene.json is not the header of a baked scene.");
-  if (header.version !== 5)
-    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 5: export it again.`);
-  return header;
-}
-
-// Bricks side by side in a texture of 8 x 8 texels each; `channels` lists the code arrays that fill r, g, b, a.
-function atlas(channels, bricks, per, count) {
-  const rows = Math.max(1, Math.ceil(bricks / per)), width = per * 8;
-  const out = new Uint8Array(width * rows * 8 * count);
-  channels.forEach((codes, channel) => {
-    for (let brick = 0; brick < bricks; brick++) {
-      const corner = Math.floor(brick / per) * 8 * width + (brick % per) * 8;
-      for (let y = 0; y < 8; y++)
-        for (let x = 0; x < 8; x++)
-          out[(corner + y * width + x) * count + channel] = codes[brick * 64 + y * 8 + x];
-    }
-  });
-  return { out, width, height: rows * 8 };
-}
-
 // The network as GLSL, its numbers in a uniform block; weights of four inputs are one vec4.
 function networkSource(shader, channels) {
   const encoded = 3 * shader.direction_octaves, inputs = channels + 3 + 2 * encoded;
@@ -182,6 +158,12 @@ function networkBlock(shader, numbers, size) {
   return block;
 }
 
+// Interpolation of the texture in use, without wrapping.
+function setSampling(gl, target, filter) {
+  for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(target, gl[`TEXTURE_${name}`], filter);
+  for (const name of ["WRAP_S", "WRAP_T"]) gl.texParameteri(target, gl[`TEXTURE_${name}`], gl.CLAMP_TO_EDGE);
+}
+
 // One window on the graphics card: first the bricks that are seen most, at half of their resolution, then all of it.
 class WindowOnCard {
   // `details` says how many training images a picture takes details from, and binds them.
@@ -232,11 +214,10 @@ class WindowOnCard {
     };
     this.freeTextures();
     this.addColumns(columns);
-    this.addAtlas([codesOf(0)], bricks, this.per, 1);
+    this.addAtlas([codesOf(0)], bricks, 1);
     for (let g = 0; g < groups; g++) {
-      const some = [];
-      for (let c = 4 * g; c < Math.min(channels, 4 * g + 4); c++) some.push(codesOf(1 + c));
-      this.addAtlas(some, bricks, this.per, 4);
+      const some = Array.from({ length: Math.min(channels - 4 * g, 4) }, (_, c) => codesOf(1 + 4 * g + c));
+      this.addAtlas(some, bricks, 4);
     }
   }
 
@@ -255,18 +236,17 @@ class WindowOnCard {
       .replaceAll("SEEN", this.details.nearest).replaceAll("COARSE", COARSE);
     const vertex = `#version 300 es
       void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
-    const program = gl.createProgram();
+    const program = gl.createProgram(), logs = [];
     for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, text);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost())
-        throw new Refusal(`The graphics card does not take the page's program (${gl.getShaderInfoLog(shader)}).`);
+      logs.push(gl.getShaderInfoLog(shader));
     }
     gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS))
-      throw new Refusal(`The graphics card does not take the page's program (${gl.getProgramInfoLog(program)}).`);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost())
+      throw new Refusal(`The graphics card does not take the page's program (${logs.join("")}${gl.getProgramInfoLog(program)}).`);
     return program;
   }
 
@@ -275,10 +255,7 @@ class WindowOnCard {
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, data);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, filter);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, filter);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    setSampling(gl, gl.TEXTURE_2D, filter);
     this.textures.push(texture);
   }
 
@@ -289,8 +266,18 @@ class WindowOnCard {
     this.addTexture(gl.RG32UI, WORD_WIDTH, height, gl.RG_INTEGER, gl.UNSIGNED_INT, padded, gl.NEAREST);
   }
 
-  addAtlas(channels, bricks, per, count) {
-    const { gl } = this, { out, width, height } = atlas(channels, bricks, per, count);
+  // Bricks side by side in a texture of 8 x 8 texels each; `channels` lists the code arrays that fill r, g, b, a.
+  addAtlas(channels, bricks, count) {
+    const { gl, per } = this, width = per * 8, height = 8 * Math.max(1, Math.ceil(bricks / per));
+    const out = new Uint8Array(width * height * count);
+    channels.forEach((codes, channel) => {
+      for (let brick = 0; brick < bricks; brick++) {
+        const corner = Math.floor(brick / per) * 8 * width + (brick % per) * 8;
+        for (let y = 0; y < 8; y++)
+          for (let x = 0; x < 8; x++)
+            out[(corner + y * width + x) * count + channel] = codes[brick * 64 + y * 8 + x];
+      }
+    });
     const [internal, format] = count === 1 ? [gl.R8, gl.RED] : [gl.RGBA8, gl.RGBA];
     this.addTexture(internal, width, height, format, gl.UNSIGNED_BYTE, out, gl.LINEAR);
   }

@@ -233,7 +233,8 @@ def test_details_are_those_of_baked_scenes(tab, detailed):
         assert tab.open(f"{address}/index.html") == "ready"
         for number in (0, 1):
             tab.evaluate(f"mmpi.camera = structuredClone(mmpi.path[{number}]); mmpi.touched(); mmpi.feed()")
-            tab.until(f"{WHOLE} && mmpi.details.views.length === 3 && mmpi.details.ready(mmpi.path[{number}])")
+            loaded = "mmpi.details.views.filter((view) => mmpi.details.layers.includes(view)).length === 3"
+            tab.until(f"{WHOLE} && {loaded}")
             a, b, field = (
                 screenshot(tab, number),
                 detailed_image(detailed, number),
