@@ -23,7 +23,7 @@ from mmpi_ns.ops.gather import COLORS, activate
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order, torch_apart
 from mmpi_show.files import Pose
-from mmpi_show.ops.splat import BLUR, Gaussians, View, splat_errors, splat_image
+from mmpi_show.ops.splat import BLUR, Gaussians, splat_errors, splat_image
 from mmpi_show.scene import CELLS, SIDE
 from mmpi_show.windows import BakedWindow
 
@@ -83,7 +83,6 @@ class _Texels:
 
     places: Int[Tensor, "T 4"]
     """MPI, plane, row, column."""
-    alphas: Float[Tensor, "T"]
     depths: Float[Tensor, "T"]
     """Optical depths."""
     channels: Float[Tensor, "T C"]
@@ -162,18 +161,18 @@ def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats
     gaussians, count = splats.gaussians, len(splats.means)
     squares, errors, opacities = torch.zeros(count, 4, 4), torch.zeros(count, 4, COLORS), torch.zeros(count, 2)
 
-    def errors_in(pose: Pose) -> tuple[View, Tensor]:
-        view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-        colors = (splats.basis(view.to_world[:, 3])[:, :, None] * splats.colors).sum(1).clamp(0, 1)
-        image = splat_image(gaussians, view, colors)
+    def errors_in(pose: Pose) -> tuple[Tensor, Tensor]:
+        basis = splats.basis(torch.tensor(pose.to_world)[:, 3])
+        colors = (basis[:, :, None] * splats.colors).sum(1).clamp(0, 1)
+        image = splat_image(gaussians, pose, colors)
         rendered = image[..., :3] + window.background * image[..., 3:]
         missing = window.render(*pose.rays())["rgb"].view(rendered.shape) - rendered
-        return view, splat_errors(gaussians, view, colors, rendered, missing)
+        return basis, splat_errors(gaussians, pose, colors, rendered, missing)
 
-    for view, sums in in_order(errors_in, poses):
+    for basis, sums in in_order(errors_in, poses):
         opacities += sums[:, 4:]
         seen = sums[:, 3].nonzero()[:, 0]
-        basis, sums = splats.basis(view.to_world[:, 3])[seen], sums[seen]
+        basis, sums = basis[seen], sums[seen]
         squares.index_add_(0, seen, basis[:, :, None] * basis[:, None] * sums[:, 3, None, None])
         errors.index_add_(0, seen, basis[:, :, None] * sums[:, None, :3])
     weight = squares[:, :1, 0].clamp(min=1e-6)
@@ -206,7 +205,7 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
     low, step = (torch.tensor([getattr(c, name) for c in mpis.channel_codes]) for name in ("low", "step"))
     channels = activate(low + step * codes[:, 1:])
     highest = torch.zeros(len(texels)).scatter_reduce(0, flat, peaks.flatten()[inside], "amax")
-    return _Texels(places, -torch.expm1(-depths), depths, channels, highest)
+    return _Texels(places, depths, channels, highest)
 
 
 def _merged(texels: _Texels, least: float, most: int) -> tuple[Int[Tensor, "T"], Int[Tensor, "T"]]:
@@ -217,7 +216,7 @@ def _merged(texels: _Texels, least: float, most: int) -> tuple[Int[Tensor, "T"],
         raise ValueError(f"No texel has a rendering weight of {least:g} in a training view: give a smaller --weight.")
     tolerance = texels.channels.new_tensor([AGREEING_ALPHA] + [AGREEING_COLOR] * COLORS)
     tolerance = torch.cat([tolerance, tolerance.new_full((texels.channels.shape[1] - COLORS,), AGREEING_FEATURE)])
-    values = torch.cat([texels.alphas[:, None], texels.channels], -1)[is_seen] / tolerance
+    values = torch.cat([-torch.expm1(-texels.depths)[:, None], texels.channels], -1)[is_seen] / tolerance
     head, plane, y, x = texels.places[is_seen].unbind(-1)
     wide = int(texels.places.max()) + 1
     level = torch.zeros_like(x)

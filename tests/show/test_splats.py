@@ -12,7 +12,7 @@ from random_bricks import random_window, scene_of
 
 from mmpi_show import splats
 from mmpi_show.files import Pose
-from mmpi_show.ops.splat import Gaussians, View, splat_errors, splat_image
+from mmpi_show.ops.splat import Gaussians, splat_errors, splat_image
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +97,7 @@ def test_fitted_colours_come_closer_to_the_window(window):
     end = splats.splats_of(window, poses, 0.0, 10**6, rounds=4)
 
     def error(made, pose):
-        view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-        rendered = splat_image(made.gaussians, view, colors_from(made, view.to_world[:, 3]))
+        rendered = splat_image(made.gaussians, pose, colors_from(made, torch.tensor(pose.to_world)[:, 3]))
         target = window.render(*pose.rays())["rgb"].view(*rendered.shape[:2], 3)
         return float((rendered[..., :3] + 0.5 * rendered[..., 3:] - target).square().mean())
 
@@ -116,7 +115,7 @@ def colors_from(made, eye):
 # Gaussians seen by a camera, against a renderer in float64 that goes pixel by pixel -----------------------------------
 
 PLACE = torch.eye(4)[:3] + torch.tensor([[0, 0, 0, 0.3], [0, 0, 0, -0.2], [0, 0, 0, 1.0]])
-VIEW = View(PLACE, (19, 13), (15.0, 14.0), (8.2, 7.1))
+VIEW = Pose(PLACE.tolist(), (19, 13), (15.0, 14.0), (8.2, 7.1))
 
 
 def some(count=60, seed=0):
@@ -131,7 +130,7 @@ def some(count=60, seed=0):
 
 def by_hand(gaussians, view, colors):
     """The image and each Gaussian's weights, one pixel and one Gaussian after the other. [H, W, 4], [H, W, N]"""
-    to_world = view.to_world.double().numpy()
+    to_world = np.array(view.to_world)
     width, height = view.size
     image, weights = np.zeros((height, width, 4)), np.zeros((height, width, len(colors)))
     seen = []

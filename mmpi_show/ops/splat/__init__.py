@@ -6,7 +6,7 @@ Only ``mmpi-export splats`` needs it, and it has no form in plain torch. Source:
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.build import arguments, library, structs
 from mmpi_ns.ops.layout import dense
+from mmpi_show.files import Pose
 from mmpi_show.ops import OPS
 
 BLUR = 0.3
@@ -29,33 +30,22 @@ class Gaussians(NamedTuple):
     alphas: Float[Tensor, "N"]
 
 
-class View(NamedTuple):
-    """A pinhole."""
-
-    to_world: Float[Tensor, "3 4"]
-    """From camera axes (x right, y up, looking along -z)."""
-    size: tuple[int, int]
-    """Width and height, pixels."""
-    focal: tuple[float, float]
-    center: tuple[float, float]
-
-
-def splat_image(gaussians: Gaussians, view: View, colors: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 4"]:
+def splat_image(gaussians: Gaussians, pose: Pose, colors: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 4"]:
     """Red, green, blue without a background, and the transmittance.
 
     Args:
         gaussians: what is seen.
-        view: the camera.
+        pose: the camera.
         colors: of each Gaussian, as this camera sees it.
     """
-    image = torch.zeros(*view.size[::-1], 4)
-    _run(splat_image, gaussians, view, colors=colors, out=image)
+    image = torch.zeros(*pose.size[::-1], 4)
+    _run("mmpi_splat_image", gaussians, pose, colors, image)
     return image
 
 
 def splat_errors(
     gaussians: Gaussians,
-    view: View,
+    pose: Pose,
     colors: Float[Tensor, "N 3"],
     rendered: Float[Tensor, "H W 3"],
     errors: Float[Tensor, "H W 3"],
@@ -64,9 +54,9 @@ def splat_errors(
 
     Args:
         gaussians: what is seen.
-        view: the camera.
+        pose: the camera.
         colors: of each Gaussian, as this camera sees it.
-        shown: the rendered image with its background.
+        rendered: the image with its background.
         errors: target minus rendered image.
 
     Returns:
@@ -75,15 +65,13 @@ def splat_errors(
         J error / (sum of |J| of all Gaussians) and of |J|.
     """
     sums = torch.zeros(len(gaussians.means), 6)
-    _run(splat_errors, gaussians, view, colors=colors, rendered=rendered, errors=errors, out=sums)
+    _run("mmpi_splat_errors", gaussians, pose, colors, rendered, errors, sums)
     return sums
 
 
-def _run(function: Callable[..., Tensor], gaussians: Gaussians, view: View, out: Tensor, **tensors: Tensor) -> None:
-    """Calls the compiled form of a function, which writes to ``out``."""
-    count = len(gaussians.means)
-    numbers = map(float, (*view.to_world.flatten(), *view.focal, *view.center))
-    inputs = dense(*gaussians, *tensors.values())
-    camera, seen = structs((*numbers, *map(ctypes.c_int32, view.size))), structs((count, *inputs[:3]))
-    values = (camera, seen, *inputs[3:], out)  # referenced until it has run
-    getattr(library(OPS), f"mmpi_{function.__name__}")(*arguments(values))
+def _run(name: str, gaussians: Gaussians, pose: Pose, *tensors: Tensor) -> None:
+    """Calls a compiled function, which writes to the last tensor."""
+    inputs = dense(*gaussians, *tensors)
+    numbers = map(float, (*chain(*pose.to_world), *pose.focal, *pose.center))
+    camera, seen = structs((*numbers, *map(ctypes.c_int32, pose.size))), structs((len(gaussians.means), *inputs[:3]))
+    getattr(library(OPS), name)(*arguments((camera, seen, *inputs[3:])))
