@@ -7,9 +7,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.errors import looked_at, quoted
@@ -159,11 +157,7 @@ class Splats(_Run):
             print(f"Wrote {path}: {len(splats.means)} splats, {size / 1e6:.1f} MB.")
 
 
-Command = (
-    Annotated[Bake, tyro.conf.subcommand("bake")]
-    | Annotated[Web, tyro.conf.subcommand("web")]
-    | Annotated[Splats, tyro.conf.subcommand("splats")]
-)
+Command = Bake | Web | Splats
 
 
 def entrypoint() -> None:

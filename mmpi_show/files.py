@@ -111,8 +111,6 @@ class BakedScene:
         """The field's outputs for rays, as ``BakedWindow.render``, of the windows that they start in, mixed as in the
         model."""
         places, windows = zip(*self.windows, strict=True)
-        if len(windows) == 1:
-            return windows[0].render(origins, directions)
         return render_windows(origins, places, lambda w, rays: windows[w].render(origins[rays], directions[rays]))
 
 

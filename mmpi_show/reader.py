@@ -116,9 +116,7 @@ def camera_rays(pose: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(to_world[:, 3], directions.shape), directions / np.linalg.norm(directions, axis=-1)[:, None]
 
 
-def _cross(
-    window: Window, mpi: dict[str, Any], numbers: np.ndarray, rays: tuple[np.ndarray, ...]
-) -> tuple[np.ndarray, ...]:
+def _cross(window: Window, mpi: dict[str, Any], numbers: np.ndarray, rays: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
     """1 / distance and optical depth [R, P], texels and their shares [R, P, 4] where rays intersect an MPI's planes."""
     (origins, directions, near, far), axes = rays, np.array(mpi["axes"])
     (ox, oy, oz), (dx, dy, dz) = (
@@ -189,10 +187,8 @@ def shade(window: Window, mean: np.ndarray, directions: np.ndarray) -> np.ndarra
     x, at, numbers = np.concatenate([mean, directions, np.sin(angles), np.cos(angles)], 1), 0, window["network_array"]
     for i, (outputs, inputs) in enumerate(window["shader"]["layers"]):
         weights, biases = np.split(numbers[at : at + outputs * (inputs + 1)].astype(float), [outputs * inputs])
-        x, at = (
-            (np.maximum(x, 0) if i else x) @ weights.reshape(outputs, inputs).T + biases,
-            at + outputs * (inputs + 1),
-        )
+        x = (np.maximum(x, 0) if i else x) @ weights.reshape(outputs, inputs).T + biases
+        at += outputs * (inputs + 1)
     bound, color = window["shader"]["bound"], mean[:, :3]
     return color / (color + (1 - color) * np.exp(-bound * np.tanh(x / bound)))
 

@@ -39,7 +39,6 @@ DENSER = 1.25
 """Factor on optical depths."""
 FRACTIONS = (0.0, 0.5, 0.25, 0.75)
 """Camera positions of each round of fitting, as fractions of the way from one camera to the next."""
-ROUNDS = 4
 STEP = 1.5
 """Step size of a round; above 1 is over-relaxation."""
 OPACITY_STEP, MOST_CHANGE = 0.3, 1.0
@@ -91,7 +90,7 @@ class _Texels:
 
 
 @torch_apart()
-def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, rounds: int = ROUNDS) -> Splats:
+def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, rounds: int = len(FRACTIONS)) -> Splats:
     """A baked window as splats.
 
     Args:
@@ -135,8 +134,9 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         alphas[in_mpi] = -torch.expm1(-DENSER * depth[in_mpi] / overlap)
     colors = torch.cat([colors[:, None], torch.zeros(total, 3, COLORS)], 1)
     splats = Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
-    for number in range(rounds):  # other cameras each time, so that splats do not overfit to those of the capture
-        cameras = between(poses, FRACTIONS[number % len(FRACTIONS)])
+    # Other cameras each time, so that splats do not overfit to those of the capture.
+    for number, fraction in enumerate(FRACTIONS[:rounds]):
+        cameras = between(poses, fraction)
         splats = fitted(splats, window, track(cameras, description=f"Fitting splats, round {number + 1} of {rounds}"))
     return splats
 

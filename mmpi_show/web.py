@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from itertools import pairwise
 from pathlib import Path
 
 from mmpi_ns.ops import ends
@@ -16,24 +15,21 @@ from mmpi_show.files import HEADER
 PAGE = Path(__file__).parent / "page"
 
 
-def write_page(folder: Path, single_file: Path | None = None) -> Path:
+def write_page(folder: Path, single_file: Path | None = None) -> None:
     """Writes the page of a baked scene into its folder, or one file that contains it and opens by a double click.
 
-    Returns the file. Raises OSError if the scene is missing or the disk is full.
+    Raises OSError if the scene is missing or the disk is full.
     """
     path = single_file or folder / "index.html"
-    first, rest, last = [], [], []
+    first, rest = [], []
     if single_file is not None:
-        block = '<script type="{}" id="{}">{}</script>'
+        block, data_type = '<script type="{}" id="{}">{}</script>', "application/octet-stream"
         text = (folder / HEADER).read_text(encoding="utf-8")
         first.append(block.format("application/json", HEADER, text.replace("<", "\\u003c")))
         for row in json.loads(text)["windows"]:
-            data, kind = (folder / row["file"]).read_bytes(), "application/octet-stream"
-            ends_of_parts = (0, row["first_bytes"], row["bricks_bytes"], row["bytes"])
-            parts = [base64.b64encode(data[begin:end]).decode() for begin, end in pairwise(ends_of_parts)]
-            first.append(block.format(kind, row["file"], parts[0]))
-            rest.append(block.format(kind, f"{row['file']}.rest", parts[1]))
-            last.append(block.format(kind, f"{row['file']}.details", parts[2]))
+            data, split = (folder / row["file"]).read_bytes(), row["first_bytes"]
+            first.append(block.format(data_type, row["file"], base64.b64encode(data[:split]).decode()))
+            rest.append(block.format(data_type, f"{row['file']}.rest", base64.b64encode(data[split:]).decode()))
     march, details, page, *scripts = (
         (PAGE / name).read_text(encoding="utf-8")
         for name in ("march.glsl", "details.glsl", "index.html", "scene.js", "details.js", "page.js")
@@ -42,6 +38,5 @@ def write_page(folder: Path, single_file: Path | None = None) -> Path:
     constants = [f"const {name} = `{text}`;" for name, text in shaders.items()] + [f"const MAX_ANGLE = {MAX_ANGLE};"]
     page = page.replace("/*code*/", "\n".join([*constants, *scripts]))
     # The code between the data runs before the rest is there.
-    page = page.replace("<!--data-->", "\n".join(first)).replace("<!--rest-->", "\n".join(rest + last))
+    page = page.replace("<!--data-->", "\n".join(first)).replace("<!--rest-->", "\n".join(rest))
     write_atomically(path, lambda unfinished: unfinished.write_text(page, encoding="utf-8"))
-    return path

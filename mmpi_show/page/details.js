@@ -5,16 +5,15 @@ const COARSE = 4; // rows and columns of an image for each of its depths
 const SPARE = 2; // images on the card beyond those that a picture takes details from
 
 class Details {
-  // `changed` is called when an image has come, `failed` with an error.
-  constructor(gl, header, changed, failed) {
-    const { nearest, step } = header.details || { nearest: 0, step: 1 }, limit = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+  // `changed` is called when an image has come.
+  constructor(gl, header, changed) {
+    const { nearest, step } = header.details || { nearest: 0, step: 1 };
     const sizes = header.windows.flatMap((row) => row.views.map((view) => view.size));
     const size = [0, 1].map((axis) => Math.max(...sizes.map((s) => s[axis])));
-    const count = sizes.length && Math.max(...size) <= limit ? nearest : 0;
-    Object.assign(this, { gl, nearest: count, step, changed, failed, views: [], layers: [], pending: new Set() });
-    if (!count) return;
-    this.textures = [size, size.map((x) => Math.ceil(x / COARSE))].map((wh) => this.addArray(...wh, count + SPARE));
-    this.layers = Array.from({ length: count + SPARE }, () => null); // the view that each holds
+    Object.assign(this, { gl, nearest, step, changed, views: [], layers: [], pending: new Set() });
+    if (!nearest) return;
+    this.textures = [size, size.map((x) => Math.ceil(x / COARSE))].map((wh) => this.addArray(...wh, nearest + SPARE));
+    this.layers = Array.from({ length: nearest + SPARE }, () => null); // the view that each holds
   }
 
   addArray(width, height, layers) {
@@ -77,7 +76,7 @@ class Details {
       }
       for (const image of images) image.close();
     } catch (error) {
-      this.failed(new Refusal(`A file of this scene is damaged (${error.message}): copy it anew, or export the scene again.`));
+      refuse(new Refusal(`A file of this scene is damaged (${error.message}): copy it anew, or export the scene again.`));
     }
     this.pending.delete(view);
   }

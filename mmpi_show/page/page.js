@@ -34,7 +34,7 @@ class Page {
     // `alone` is {window, head} of the one MPI to show, or null for all of them.
     this.cost = 1e-5; // seconds a pixel, as the last frame took
     this.keys = new Set();
-    this.details = new Details(gl, header, () => { this.dirty = true; }, (error) => this.fail(error));
+    this.details = new Details(gl, header, () => { this.dirty = true; });
     this.windows = new Map(); // on the card, by number, least recently needed first; null while it is on its way
     this.path = header.path.map(cameraOf);
     const training = this.path.map((_, i) => i).filter((i) => !header.path[i].test);
@@ -53,14 +53,10 @@ class Page {
     const ahead = windowShares(this.header.windows, add(this.camera.eye, this.camera.axes[2], -this.speed));
     for (let w = 0; w < shares.length; w++) {
       if (shares[w] <= 0 && ahead[w] <= 0) continue;
-      if (this.windows.has(w)) {
-        const window = this.windows.get(w);
-        this.windows.delete(w);
-        this.windows.set(w, window);
-      } else {
-        this.windows.set(w, null);
-        await this.load(w, this.header.windows[w]).catch((error) => this.fail(error));
-      }
+      const window = this.windows.get(w);
+      this.windows.delete(w);
+      this.windows.set(w, window || null);
+      if (window === undefined) await this.load(w, this.header.windows[w]).catch(refuse);
     }
     for (const [w, window] of this.windows)
       if (window && this.windows.size > MOST_WINDOWS && shares[w] === 0 && ahead[w] === 0) {
@@ -74,7 +70,7 @@ class Page {
   // Draws a window from the first part of its file on; the rest follows.
   async load(w, row) {
     const told = (part) => {
-      if (!this.failed) report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
+      if (!failed()) report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
     };
     const parts = partsOf(row, told), [first, rest, views] = Array.from({ length: 3 }, async () => (await parts.next()).value);
     rest.catch(() => {}); // awaited only once the first part is drawn
@@ -82,12 +78,7 @@ class Page {
     this.windows.set(w, window);
     this.dirty = true;
     rest.then((bytes) => window.complete(bytes)).then(() => { told(1); this.dirty = true; return views; })
-      .then((bytes) => { if (!window.freed) this.details.add(row, bytes); }).catch((error) => this.fail(error));
-  }
-
-  fail(error) {
-    this.failed = true;
-    refuse(error);
+      .then((bytes) => { if (!window.freed) this.details.add(row, bytes); }).catch(refuse);
   }
 
   // Draws what a camera sees into the whole canvas of this size.
@@ -98,7 +89,6 @@ class Page {
     const lens = [camera.focal[0] * cover, camera.focal[1] * cover,
       width / 2 + (camera.center[0] - camera.size[0] / 2) * cover, height / 2 + (camera.center[1] - camera.size[1] / 2) * cover];
     gl.viewport(0, 0, width, height);
-    gl.clearColor(0, 0, 0, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE);
@@ -134,7 +124,7 @@ class Page {
       }
     }
     $("play").checked = this.playing !== null;
-    if (!this.failed) requestAnimationFrame((t) => this.frame(t));
+    if (!failed()) requestAnimationFrame((t) => this.frame(t));
   }
 
   move(elapsed) {
@@ -163,12 +153,6 @@ class Page {
     const last = this.path.length - 1, i = Math.min(Math.floor(place), Math.max(last - 1, 0));
     this.camera = between(this.path[i], this.path[Math.min(i + 1, last)], place - i);
     $("place").value = place;
-  }
-
-  // The number of the camera nearest to where one stands.
-  nearestCamera() {
-    const distances = this.path.map((c) => Math.hypot(...add(c.eye, this.camera.eye, -1)));
-    return distances.indexOf(Math.min(...distances));
   }
 
   turn(dx, dy) { // pixels of the screen: to where one drags, as in nerfstudio's viewer
@@ -215,7 +199,11 @@ class Page {
   press(key) {
     const place = Number($("place").value);
     if (key === "p" || key === " ") this.playing = this.playing !== null ? null : place < this.path.length - 1 ? place : 0;
-    else if (key === "r" || key === "n") { this.playing = null; this.go(key === "r" ? this.start : this.nearestCamera()); }
+    else if (key === "r" || key === "n") {
+      const distances = this.path.map((c) => Math.hypot(...add(c.eye, this.camera.eye, -1)));
+      this.playing = null;
+      this.go(key === "r" ? this.start : distances.indexOf(Math.min(...distances)));
+    }
     else if (key === "1" || key === "2" || key === "3") this.mode = Number(key) - 1;
     else if (key === "m") {
       const window = this.nearest(), head = this.alone ? this.alone.head + 1 : 0;
@@ -260,17 +248,15 @@ function listen(page, canvas) {
   canvas.addEventListener("webglcontextlost", () => refuse(new Refusal("The graphics card was reset: reload the page.")));
 }
 
-function report(text) {
-  $("status").textContent = text;
-}
+const report = (text) => { $("status").textContent = text; };
+const failed = () => document.body.dataset.state === "failed";
 
 function refuse(error) {
   document.body.dataset.state = "failed";
   report(error instanceof Refusal ? error.message : `This page does not work here (${error}): reload it, or try another browser.`);
 }
 
-const parsed = new Promise((done) =>
-  document.readyState === "loading" ? document.addEventListener("DOMContentLoaded", done) : done());
+const parsed = new Promise((done) => document.addEventListener("DOMContentLoaded", done));
 
 function decoded(id) {
   const text = atob($(id).textContent.trim()), bytes = new Uint8Array(text.length);
@@ -284,8 +270,9 @@ async function* partsOf(row, progress) {
   if ($(row.file)) {
     yield decoded(row.file);
     await parsed;
-    yield decoded(`${row.file}.rest`);
-    yield decoded(`${row.file}.details`);
+    const later = decoded(`${row.file}.rest`), split = row.bricks_bytes - row.first_bytes;
+    yield later.subarray(0, split);
+    yield later.subarray(split);
     return;
   }
   const response = await fetch(row.file, { cache: "no-cache" });
@@ -328,7 +315,7 @@ async function main() {
   document.title = page.header.name;
   window.mmpi = page; // for tests and tinkering
   await page.feed();
-  if (page.failed) return;
+  if (failed()) return;
   listen(page, $("view"));
   document.body.dataset.state = "ready";
   requestAnimationFrame((t) => page.frame(t));

@@ -57,14 +57,17 @@ function neighbours(mpis, columns, bricks) {
   return { right, below };
 }
 
-// Codes of every second row and column from their differences, both [16, bricks], in place.
-function sumDifferences(stored) {
-  const bricks = stored.length / 16;
-  for (let b = 1; b < bricks; b++) stored[b] += stored[b - 1];
-  for (let p = 1; p < 16; p++)
-    if (p % 4) for (let b = 0; b < bricks; b++) stored[p * bricks + b] += stored[(p - 1) * bricks + b];
-  for (let at = 4 * bricks; at < stored.length; at++) stored[at] += stored[at - 4 * bricks];
-  return stored;
+// Codes of every second row and column of all channels from their differences, both [channels, 16, bricks], in place.
+function sumDifferences(all, channels) {
+  const each = all.length / channels, bricks = each / 16;
+  for (let c = 0; c < channels; c++) {
+    const stored = all.subarray(c * each, (c + 1) * each);
+    for (let b = 1; b < bricks; b++) stored[b] += stored[b - 1];
+    for (let p = 1; p < 16; p++)
+      if (p % 4) for (let b = 0; b < bricks; b++) stored[p * bricks + b] += stored[(p - 1) * bricks + b];
+    for (let at = 4 * bricks; at < each; at++) stored[at] += stored[at - 4 * bricks];
+  }
+  return all;
 }
 
 // Puts such codes into the 8 x 8 of the bricks of these numbers.
@@ -104,29 +107,26 @@ function halves(data) {
   });
 }
 
-// The network as GLSL, its numbers in a uniform block; weights of four inputs are one vec4.
+// The network as GLSL, its numbers in a uniform block; weights of four inputs are one vec4, and biases those of an input of 1.
 function networkSource(shader, channels) {
-  const encoded = 3 * shader.direction_octaves, inputs = channels + 3 + 2 * encoded;
-  const lines = [], quads = (n) => Math.ceil(n / 4);
-  let block = 0, from = "x0";
-  shader.layers.forEach(([outputs, given], layer) => {
-    const to = `x${layer + 1}`, width = quads(given);
-    lines.push(`float ${to}[${4 * quads(outputs)}];`);
-    lines.push(`for (int o = 0; o < ${4 * quads(outputs)}; o++) ${to}[o] = 0.0;`);
-    lines.push(`for (int o = 0; o < ${outputs}; o++) { int at = ${block} + o * ${width + 1};`);
-    lines.push(`  float sum = numbers[at + ${width}].x;`);
-    lines.push(`  for (int i = 0; i < ${width}; i++) sum += dot(numbers[at + i],`);
+  const encoded = 3 * shader.direction_octaves, lines = [], quads = (n) => Math.ceil((n + 1) / 4);
+  let block = 0;
+  const begun = (x, size) => `float ${x}[${4 * quads(size)}]; for (int i = 0; i < ${4 * quads(size)}; i++) ${x}[i] = float(i == ${size});`;
+  shader.layers.forEach(([outputs, inputs], layer) => {
+    const from = `x${layer}`, to = `x${layer + 1}`;
+    lines.push(begun(to, outputs));
+    lines.push(`for (int o = 0; o < ${outputs}; o++) { float sum = 0.0;`);
+    lines.push(`  for (int i = 0; i < ${quads(inputs)}; i++) sum += dot(numbers[${block} + o * ${quads(inputs)} + i],`);
     lines.push(`    vec4(${from}[4 * i], ${from}[4 * i + 1], ${from}[4 * i + 2], ${from}[4 * i + 3]));`);
     lines.push(`  ${to}[o] = ${layer + 1 < shader.layers.length ? "max(sum, 0.0)" : "sum"}; }`);
-    block += outputs * (width + 1);
-    from = to;
+    block += outputs * quads(inputs);
   });
+  const last = `x${shader.layers.length}`;
   return {
     size: block,
     source: `layout(std140) uniform Network { vec4 numbers[${block}]; };
 vec3 shade(vec4 sums[GROUPS], float mass, vec3 direction) {
-  float x0[${4 * quads(inputs)}];
-  for (int i = 0; i < ${4 * quads(inputs)}; i++) x0[i] = 0.0;
+  ${begun("x0", channels + 3 + 2 * encoded)}
   for (int c = 0; c < ${channels}; c++) x0[c] = (c < 3 ? 1.0 : 2.0) * sums[c >> 2][c & 3] / mass - (c < 3 ? 0.0 : 1.0);
   vec3 mean = vec3(x0[0], x0[1], x0[2]);
   for (int a = 0; a < 3; a++) x0[${channels} + a] = direction[a];
@@ -136,7 +136,7 @@ vec3 shade(vec4 sums[GROUPS], float mass, vec3 direction) {
     x0[${channels + 3 + encoded} + i] = cos(angle);
   }
   ${lines.join("\n  ")}
-  vec3 change = vec3(${from}[0], ${from}[1], ${from}[2]) / ${shader.bound.toFixed(6)};
+  vec3 change = vec3(${last}[0], ${last}[1], ${last}[2]) / ${shader.bound.toFixed(6)};
   return mean / (mean + (1.0 - mean) * exp(-${shader.bound.toFixed(6)} * tanh(clamp(change, -9.0, 9.0))));
 }`,
   };
@@ -147,13 +147,11 @@ function networkBlock(shader, numbers, size) {
   const block = new Float32Array(4 * size);
   let from = 0, to = 0;
   for (const [outputs, inputs] of shader.layers) {
-    const width = Math.ceil(inputs / 4), biases = from + outputs * inputs;
-    for (let o = 0; o < outputs; o++) {
-      for (let i = 0; i < inputs; i++) block[4 * (to + o * (width + 1)) + i] = numbers[from + o * inputs + i];
-      block[4 * (to + o * (width + 1) + width)] = numbers[biases + o];
+    for (let o = 0; o < outputs; o++, to += 4 * Math.ceil((inputs + 1) / 4)) {
+      block.set(numbers.subarray(from + o * inputs, from + (o + 1) * inputs), to);
+      block[to + inputs] = numbers[from + outputs * inputs + o];
     }
-    from = biases + outputs;
-    to += outputs * (width + 1);
+    from += outputs * (inputs + 1);
   }
   return block;
 }
@@ -180,9 +178,8 @@ class WindowOnCard {
     card.detailed = details.nearest > 0 && uniforms <= gl.getParameter(gl.MAX_FRAGMENT_UNIFORM_VECTORS);
     card.program = card.compile(network.source);
     card.earlyMasks = await unpack(bytes, arrays.early_columns);
-    card.early = await unpack(bytes, arrays.early);
-    const numbers = halves(await unpack(bytes, arrays.network)), each = card.early.length / (channels.length + 1);
-    for (let c = 0; c <= channels.length; c++) sumDifferences(card.early.subarray(c * each, (c + 1) * each));
+    card.early = sumDifferences(await unpack(bytes, arrays.early), channels.length + 1);
+    const numbers = halves(await unpack(bytes, arrays.network));
     card.fill(card.earlyMasks, [[card.early, Array.from({ length: arrays.early.shape[2] }, (_, b) => b)]], null);
     card.setConstants(networkBlock(row.shader, numbers, network.size));
     return card;
@@ -191,11 +188,10 @@ class WindowOnCard {
   // The rest of the file.
   async complete(bytes) {
     const { arrays, channels, first_bytes } = this.row;
-    const masks = await unpack(bytes, arrays.columns, first_bytes), late = await unpack(bytes, arrays.late, first_bytes);
+    const masks = await unpack(bytes, arrays.columns, first_bytes);
+    const late = sumDifferences(await unpack(bytes, arrays.late, first_bytes), channels.length + 1);
     const fine = await unpack(bytes, arrays.fine, first_bytes), [first, others] = earlyAndLate(masks, this.earlyMasks);
     if (this.freed) return;
-    const each = late.length / (channels.length + 1);
-    for (let c = 0; c <= channels.length; c++) sumDifferences(late.subarray(c * each, (c + 1) * each));
     this.fill(masks, [[this.early, first], [late, others]], fine);
     this.early = this.earlyMasks = null;
     this.whole = true;
@@ -203,7 +199,7 @@ class WindowOnCard {
 
   // Textures of the bricks of `masks`. `parts`: coarse codes of all channels, and the numbers of their bricks.
   fill(masks, parts, fine) {
-    const { row, groups } = this, channels = row.channels.length, bricks = parts.reduce((n, [, numbers]) => n + numbers.length, 0);
+    const { gl, row, groups } = this, channels = row.channels.length, bricks = parts.reduce((n, [, numbers]) => n + numbers.length, 0);
     const columns = numberedColumns(masks), beside = neighbours(row.mpis, columns, bricks);
     const codesOf = (channel) => {
       const codes = new Uint8Array(64 * bricks);
@@ -213,7 +209,9 @@ class WindowOnCard {
       return codes;
     };
     this.freeTextures();
-    this.addColumns(columns);
+    const height = Math.max(1, Math.ceil(masks.length / WORD_WIDTH)), padded = new Uint32Array(2 * WORD_WIDTH * height);
+    padded.set(columns);
+    this.addTexture(gl.RG32UI, WORD_WIDTH, height, gl.RG_INTEGER, gl.UNSIGNED_INT, padded, gl.NEAREST);
     this.addAtlas([codesOf(0)], bricks, 1);
     for (let g = 0; g < groups; g++) {
       const some = Array.from({ length: Math.min(channels - 4 * g, 4) }, (_, c) => codesOf(1 + 4 * g + c));
@@ -257,13 +255,6 @@ class WindowOnCard {
     gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, data);
     setSampling(gl, gl.TEXTURE_2D, filter);
     this.textures.push(texture);
-  }
-
-  addColumns(columns) {
-    const { gl } = this, height = Math.max(1, Math.ceil(columns.length / 2 / WORD_WIDTH));
-    const padded = new Uint32Array(2 * WORD_WIDTH * height);
-    padded.set(columns);
-    this.addTexture(gl.RG32UI, WORD_WIDTH, height, gl.RG_INTEGER, gl.UNSIGNED_INT, padded, gl.NEAREST);
   }
 
   // Bricks side by side in a texture of 8 x 8 texels each; `channels` lists the code arrays that fill r, g, b, a.
@@ -311,11 +302,9 @@ class WindowOnCard {
     gl.uniform1i(this.uniform("columns"), 0);
     gl.uniform1i(this.uniform("density"), 1);
     gl.uniform1iv(this.uniform("texels"), Array.from({ length: this.groups }, (_, g) => 2 + g));
-    const block = gl.getUniformBlockIndex(this.program, "Network");
     this.buffer = gl.createBuffer();
     gl.bindBuffer(gl.UNIFORM_BUFFER, this.buffer);
     gl.bufferData(gl.UNIFORM_BUFFER, network, gl.STATIC_DRAW);
-    gl.uniformBlockBinding(this.program, block, 0);
   }
 
   draw(view, share) {
@@ -351,7 +340,6 @@ class WindowOnCard {
 
 // Share of each window in a ray that starts at `eye` (as scene/windows.py): full in its ball, falling off beyond.
 function windowShares(rows, eye) {
-  if (rows.length === 1) return [1];
   const beyond = rows.map((r) => Math.hypot(...r.center.map((c, a) => c - eye[a])) - r.radius);
   const raw = rows.map((r, w) => Math.min(1, Math.max(0, 1 - beyond[w] / r.margin)));
   const total = raw.reduce((a, b) => a + b, 0);

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import math
 
 import torch
 from jaxtyping import Float
@@ -20,7 +19,7 @@ from mmpi_ns.ops.march import RayOutputs, Rays, ray_outputs
 from mmpi_ns.scene.geometry import Frames
 from mmpi_show import reader
 from mmpi_show.ops import OPS
-from mmpi_show.scene import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, tiles_of
+from mmpi_show.scene import FINENESS, MOST_CHANNELS, BakedMpis, tiles_of
 
 
 @operation()
@@ -36,12 +35,7 @@ def render_baked(
         peaks: of every texel, raised to the largest weight of a sample that reads it.
     """
     window: reader.Window = {  # as the reader has it from a file
-        "mpis": [
-            vars(mpi)
-            | {"far": None if math.isinf(mpi.far) else mpi.far}
-            | {"interval": interval, "first_column": scene.first_column(k)}
-            for k, (mpi, interval) in enumerate(zip(scene.mpis, scene.intervals, strict=True))
-        ],
+        "mpis": [vars(mpi) | {"interval": interval} for mpi, interval in zip(scene.mpis, scene.intervals, strict=True)],
         "density": vars(scene.density_codes),
         "channels": [vars(c) for c in scene.channel_codes],
         "columns_array": scene.columns.numpy().view("uint32"),
@@ -68,17 +62,10 @@ def render_baked(
     return RayOutputs(*(x.to(rays.origins) for x in outputs))
 
 
-def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A contiguous tensor of this shape and type, for compiled code, which checks nothing itself."""
-    assert x.shape == shape and x.dtype == dtype, f"{list(x.shape)} {x.dtype} where {list(shape)} {dtype} is read"
-    return x.contiguous()
-
-
 @render_baked.on_cpu
 def render_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: Tensor | None = None) -> RayOutputs:
     if "cpu" not in scene.packed:
-        count, bricks, channels = len(scene.mpis), scene.num_bricks, len(scene.channel_codes)
-        assert channels <= MOST_CHANNELS
+        count, channels = len(scene.mpis), len(scene.channel_codes)
         codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
         # Transmittance of a sample of each MPI, at codes 0, 1/8, 2/8, ... 255.
         through = [torch.exp(-scene.optical_depth(k, codes)).float().contiguous() for k in range(count)]
@@ -89,20 +76,16 @@ def render_baked_on_cpu(scene: BakedMpis, rays: Rays, threshold: float, peaks: T
             sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], scene.first_column(k))
             places = map(float, (mpi.disparity_step, 1 / mpi.far, u0, v0, *scales))
             stacks.append((*places, *map(ctypes.c_int32, sizes)))
-        density = shaped(scene.density, bricks, SIDE, SIDE, dtype=torch.uint8)
-        texels = shaped(scene.texels, bricks, SIDE, SIDE, channels, dtype=torch.uint8)
         low, step = (torch.tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
         doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
         tables = [
-            shaped(scene.columns, scene.first_column(count), 2, dtype=torch.int32),
+            *dense(scene.columns, dtype=torch.int32),
             # Sixteen channels are read at once, also those of the last texel, and four densities.
-            *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (density, texels)),
+            *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in dense(scene.density, scene.texels, dtype=torch.uint8)),
             *(pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)),
         ]
         # Nothing is read of the rest of ``SceneLayout.constants``.
         mpis = pad(frame_rows(Frames.pack(scene.mpis)), (0, 7))
         scene.packed["cpu"] = structs((count, channels, mpis, structs(*stacks), structs(through), *tables))
-    if peaks is not None:
-        assert dense(peaks)[0] is peaks, "peaks are written in place"
     walk = (scene.packed["cpu"], structs(dense_fields(rays)), float(threshold), peaks)
     return ray_outputs("mmpi_render_baked", len(rays.origins), len(scene.channel_codes), *walk, folder=OPS)
