@@ -73,7 +73,7 @@ class Page {
       if (!failed()) report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
     };
     const parts = partsOf(row, told), [first, rest, views] = Array.from({ length: 3 }, async () => (await parts.next()).value);
-    rest.catch(() => {}); // awaited only once the first part is drawn
+    for (const later of [rest, views]) later.catch(() => {}); // awaited only once the first part is drawn
     const window = await WindowOnCard.load(this.gl, row, await first, this.details);
     this.windows.set(w, window);
     this.dirty = true;
