@@ -7,9 +7,10 @@ const SPARE = 2; // images on the card beyond those that a picture takes details
 class Details {
   // `changed` is called when an image has come.
   constructor(gl, header, changed) {
-    const { nearest, step } = header.details || { nearest: 0, step: 1 };
+    const { nearest: most, step } = header.details || { nearest: 0, step: 1 };
     const sizes = header.windows.flatMap((row) => row.views.map((view) => view.size));
     const size = [0, 1].map((axis) => Math.max(...sizes.map((s) => s[axis])));
+    const nearest = Math.max(...size) <= gl.getParameter(gl.MAX_TEXTURE_SIZE) ? most : 0; // larger ones show the field alone
     Object.assign(this, { gl, nearest, step, changed, views: [], layers: [], pending: new Set() });
     if (!nearest) return;
     this.textures = [size, size.map((x) => Math.ceil(x / COARSE))].map((wh) => this.addArray(...wh, nearest + SPARE));
