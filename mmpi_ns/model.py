@@ -25,15 +25,7 @@ from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
 from mmpi_ns.rendering.metrics import ImageMetrics, pictures, psnr_and_ssim
-from mmpi_ns.rendering.rendered import (
-    BACKGROUNDS,
-    Exposures,
-    background_of,
-    bounded,
-    render_outputs,
-    render_rays,
-    winners,
-)
+from mmpi_ns.rendering.rendered import BACKGROUNDS, Exposures, background_of, bounded, render_outputs, render_rays
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.sampler import march_options
 from mmpi_ns.scene.plan import NO_PLAN
@@ -160,8 +152,8 @@ class MMPIModel(Model):
         return {"training": replace(rays, times=len(bundle) // asked)}
 
     def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:
-        """rgb, accumulation, depth, winning MPI, pixels of its texels and dropped mass [R, .] of rays, from the windows
-        that they start in. ``chunk``: rays that a window renders at once; None: all."""
+        """rgb, accumulation, depth, winning MPI and dropped mass [R, .] of rays, from the windows that they start in.
+        ``chunk``: rays that a window renders at once; None: all."""
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
         present = [*range(trained + 1)]  # finished windows, and the one being trained
@@ -183,8 +175,8 @@ class MMPIModel(Model):
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
     ) -> dict[str, Tensor]:
-        """``image_outputs`` of one window, by its number and field; winning MPIs are counted through all windows.
-        ``chosen``: the only (window, head) to render; None for all."""
+        """``image_outputs`` of one window, by its number and field; winning MPIs are counted through all windows, a
+        finer copy as its MPI. ``chosen``: the only (window, head) to render; None for all."""
         first_head = sum(p.num_heads for p in self.progress.windows.plans[:window])
         background = background_of(self.config.rendering.background, bundle.origins)
         bundle = bounded(bundle, field.plan)
@@ -197,7 +189,7 @@ class MMPIModel(Model):
         threshold = self.config.rendering.threshold
         outputs = render_outputs(bundle, field, blends=blends, threshold=threshold, head_mask=head_mask)
         behind = outputs.pop("transmittance") * background.to(outputs["rgb"])
-        outputs |= winners(outputs, bundle, field, first_head)
+        outputs["winning_mpi"] = field.planned_heads(outputs["winning_mpi"]) + first_head
         exposure = self.exposures.mean
         if exposure is None:
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1)}

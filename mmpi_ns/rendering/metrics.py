@@ -7,7 +7,6 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
-from nerfstudio.utils.colormaps import apply_float_colormap
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -83,7 +82,7 @@ def ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) ->
 
 
 def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:
-    """Pictures of a rendered image's outputs. Pixels per texel: blue up to 1/2, green 2, red from 8 on."""
+    """Pictures of a rendered image's outputs."""
     near = 1 / outputs["depth"].clamp(min=1e-9)
     some = near.flatten()[:: 1 + near.numel() // MOST_SORTED]
     return {
@@ -91,7 +90,6 @@ def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_h
         "accumulation": outputs["accumulation"].expand(-1, -1, 3),
         "inverse_depth": (near / some.quantile(0.98).clamp(min=1e-9)).clamp(0, 1).expand(-1, -1, 3),
         "winning_mpi": head_palette(num_heads, observed.device)[outputs["winning_mpi"][..., 0].long()],
-        "texel_pixels": apply_float_colormap((outputs["texel_pixels"].clamp(0.5, 8).log2() + 1) / 4, "turbo"),
     }
 
 

@@ -91,38 +91,6 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     return bundle
 
 
-def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, first_head: int) -> dict[str, Tensor]:
-    """Outputs about the heads with the most weight on each ray.
-
-    Args:
-        outputs: of one window; heads are counted as in the field.
-        bundle: the rays.
-        field: of the window.
-        first_head: number of its first head among those of all windows.
-
-    Returns:
-        ``winning_mpi``: their numbers among all windows, where a finer copy has that of its MPI. ``texel_pixels``: the
-            pixels that one of their texels spans along its longer side at the depth of the ray; 0 where the
-            accumulation is below a half.
-    """
-    heads, plan, frames = outputs["winning_mpi"][:, 0].long(), field.plan, field.layout.frames
-    mpi = heads.clamp(max=len(plan.mpis) - 1)
-    spans = [
-        max((m.extent[1] - m.extent[0]) / (m.width - 1), (m.extent[3] - m.extent[2]) / (m.height - 1))
-        for m in plan.mpis
-    ]
-    points = bundle.origins + outputs["depth"] * bundle.directions
-    depths = ((points - frames.origins[mpi]) * frames.axes[mpi, 2]).sum(-1)
-    sizes = depths * depths.new_tensor(spans)[mpi]
-    if plan.cube is not None:
-        sides = zip(plan.cube.lower, plan.cube.upper, plan.cube.shape[::-1], strict=True)
-        voxel = max((high - low) / (count - 1) for low, high, count in sides)
-        sizes = torch.where(heads == len(plan.mpis), voxel, sizes)
-    pixels = sizes[:, None] / (outputs["depth"] * bundle.pixel_area.sqrt())
-    drawn = torch.where(outputs["accumulation"] > 0.5, pixels, 0.0)
-    return {"winning_mpi": field.planned_heads(outputs["winning_mpi"]) + first_head, "texel_pixels": drawn}
-
-
 def render_rays(
     bundle: RayBundle,
     field: MMPIField,

@@ -265,7 +265,7 @@ def test_lpips_is_left_out_with_a_message_where_its_weights_are_not_available(
         assert all(isinstance(v, float) and np.isfinite(v) for v in values.values())
     assert len(calls) == 1, "one attempt is enough"
     assert "LPIPS is left out" in " ".join(capsys.readouterr().out.split())
-    assert set(images) == {"img", "accumulation", "inverse_depth", "winning_mpi", "texel_pixels"}
+    assert set(images) == {"img", "accumulation", "inverse_depth", "winning_mpi"}
     for name, image in images.items():
         assert image.shape == (HEIGHT, WIDTH * (2 if name == "img" else 1), 3), name
         assert image.min() >= 0 and image.max() <= 1

@@ -44,7 +44,6 @@ def test_pictures_of_more_pixels_than_torch_sorts_are_made():
     outputs = {
         "depth": (1 / row)[None, :, None].expand(side, side, 1), "rgb": one.expand(side, side, 3),
         "accumulation": one.expand(side, side, 1), "winning_mpi": one.long().expand(side, side, 1),
-        "texel_pixels": one.expand(side, side, 1),
     }  # fmt: skip
     rendered = pictures(one.expand(side, side, 3), outputs, 2)["inverse_depth"]
     brightest = torch.quantile(row, 0.98)

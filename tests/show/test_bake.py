@@ -14,7 +14,7 @@ from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
 from mmpi_ns.field.shading import RayShader
-from mmpi_ns.rendering.rendered import bounded, render_outputs, winners
+from mmpi_ns.rendering.rendered import bounded, render_outputs
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_show import __main__ as export
 from mmpi_show.bake import bake_run, compare
@@ -57,7 +57,7 @@ def outputs(model, how, rays):
             return model.get_outputs(copy.deepcopy(rays))
         bundle, field = bounded(copy.deepcopy(rays), model.field.plan), model.field
         drawn = bake(model, field).render(bundle.origins, bundle.directions)
-        return drawn | winners(drawn, bundle, field, 0)
+        return drawn | {"winning_mpi": field.planned_heads(drawn["winning_mpi"])}
 
 
 def test_baked_images_are_the_exact_ones(trainer, monkeypatch):
