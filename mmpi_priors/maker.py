@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,11 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
 from torch import Tensor
 
 from mmpi_ns.data.dataset import image_and_mask
-from mmpi_ns.data.exif import light_of
+from mmpi_ns.data.exif import SHOT, positive_number, tags_of
 from mmpi_ns.data.posed_images import at_full_size, posed_images
 from mmpi_ns.data.priors import DepthPriors, Gains, Priors, PriorsMaker, SharedPoints
 from mmpi_ns.placement.observations import Observations
@@ -119,3 +121,20 @@ class CapturePriors(PriorsMaker):
             return exposure_of_image(posed, self.dataset, factors, falloff, camera, observed, outputs)
         except (InputError, OSError):  # the training images are gone
             return None
+
+
+def light_of(file: Path) -> float:
+    """Exposure of an image by its EXIF, in arbitrary units: time * sensitivity / aperture squared.
+
+    NaN without an exposure time, as in frames of videos, or if the file is damaged, which is reported when its pixels
+    are read.
+
+    Source: CIPA DC-008 (Exif 2.32), tags ExposureTime, PhotographicSensitivity and FNumber.
+    """
+    try:
+        with Image.open(file) as image:
+            tags = tags_of(image).get_ifd(ExifTags.IFD.Exif)
+    except OSError:
+        return float("nan")
+    time, aperture, sensitivity = (positive_number(tags.get(tag)) for tag in SHOT[:3])
+    return (time or float("nan")) * (sensitivity or 100.0) / (aperture or 1.0) ** 2

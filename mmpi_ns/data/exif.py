@@ -1,8 +1,7 @@
-"""EXIF of photos: the exposure that a camera noted, and the tags that copies of a photo keep."""
+"""EXIF of photos: their tags, and those that copies of a photo keep."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from PIL import ExifTags, Image
@@ -23,23 +22,6 @@ def tags_of(image: Image.Image) -> Image.Exif:
         return image.getexif()
     except (SyntaxError, ValueError):
         return Image.Exif()
-
-
-def light_of(file: Path) -> float:
-    """Exposure of an image by its EXIF, in arbitrary units: time * sensitivity / aperture squared.
-
-    NaN without an exposure time, as in frames of videos, or if the file is damaged, which is reported when its pixels
-    are read.
-
-    Source: CIPA DC-008 (Exif 2.32), tags ExposureTime, PhotographicSensitivity and FNumber.
-    """
-    try:
-        with Image.open(file) as image:
-            tags = tags_of(image).get_ifd(ExifTags.IFD.Exif)
-    except OSError:
-        return float("nan")
-    time, aperture, sensitivity = (positive_number(tags.get(tag)) for tag in SHOT[:3])
-    return (time or float("nan")) * (sensitivity or 100.0) / (aperture or 1.0) ** 2
 
 
 def positive_number(value: Any) -> float | None:

@@ -56,7 +56,7 @@ def library_file(folder: Path = OPS) -> Path:
     sources = sorted(folder.glob("*/*.cpp"))
     if not sources:
         raise CannotCompile(f"{folder} holds no C++ sources: install the package again")
-    texts = [p.read_bytes() for p in [*sources, *sorted(HEADERS.glob("*.h"))]]
+    texts = [p.read_bytes() for p in [*sources, *sorted({*HEADERS.glob("*.h"), *folder.glob("cpp/*.h")})]]
     try:  # what -march=native depends on: different machines may share a home folder
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         processor = "".join(sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))}))

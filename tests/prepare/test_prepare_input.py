@@ -10,7 +10,6 @@ import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
-from mmpi_ns.data.exif import light_of
 from mmpi_ns.utils.errors import InputError
 from mmpi_prepare import checks, export, features
 from mmpi_prepare.images import (
@@ -24,6 +23,7 @@ from mmpi_prepare.images import (
 from mmpi_prepare.pipeline import prepare
 from mmpi_prepare.poses import make_cameras
 from mmpi_prepare.settings import Settings
+from mmpi_priors.maker import light_of
 
 
 def save(path, size=(40, 30), value=100, **more):

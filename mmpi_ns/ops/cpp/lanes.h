@@ -73,13 +73,6 @@ inline Lanes load(const float* from) {
     return x;
 }
 
-inline Lanes root(Lanes x) {
-    float each[WIDTH];
-    __builtin_memcpy(each, &x, sizeof each);
-    for (float& number : each) number = std::sqrt(number);
-    return load(each);
-}
-
 // Sixteen numbers of a table.
 inline IntLanes gather(const int32_t* table, IntLanes at) {
 #ifdef __AVX512F__
@@ -97,25 +90,6 @@ inline Lanes gather(const float* table, IntLanes at) {
 
 inline void store(float* to, Lanes x) { __builtin_memcpy(to, &x, sizeof x); }
 inline void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
-
-// Loads and stores of the first `count` of sixteen numbers; the others are 0.
-template <typename To, typename From> inline To load_some(const From* from, int64_t count) {
-    To x{};
-    static_assert(sizeof x == WIDTH * sizeof *from, "sixteen numbers");
-    if (count >= WIDTH)
-        __builtin_memcpy(&x, from, sizeof x);
-    else
-        __builtin_memcpy(&x, from, count * sizeof *from);
-    return x;
-}
-
-template <typename From, typename To> inline void store_some(To* to, const From& x, int64_t count) {
-    static_assert(sizeof x == WIDTH * sizeof *to, "sixteen numbers");
-    if (count >= WIDTH)
-        __builtin_memcpy(to, &x, sizeof x);
-    else
-        __builtin_memcpy(to, &x, count * sizeof *to);
-}
 
 typedef uint8_t ByteLanes __attribute__((vector_size(WIDTH)));
 

@@ -1,5 +1,5 @@
 // How alike an image and others are at some inverse depths, by windows whose sums slide from row to row.
-#include "lanes.h"
+#include "../cpp/some.h"
 #include "parts.h"
 
 #include <algorithm>

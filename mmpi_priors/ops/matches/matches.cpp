@@ -1,5 +1,5 @@
 // Parallax between two images, sixteen pixels at a time: places of pixels, depths of matches, means of measurements.
-#include "lanes.h"
+#include "../cpp/some.h"
 #include "parts.h"
 
 #include <algorithm>

@@ -1,5 +1,5 @@
 // Planes through the pixels of an image that make other images look like it, sixteen pixels at a time.
-#include "lanes.h"
+#include "../cpp/some.h"
 #include "parts.h"
 
 #include <algorithm>
