@@ -25,7 +25,7 @@ from mmpi_ns.data.rays import image_rays
 from mmpi_ns.functional import CameraPath, Scene
 from mmpi_ns.rendering.details import Details, DetailView
 from mmpi_ns.rendering.images import FUSED_RAYS, render_in_chunks, render_windows
-from mmpi_ns.scene.columns import bits_of
+from mmpi_ns.scene.bricks import bits_of
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
 from mmpi_ns.utils.errors import InputError

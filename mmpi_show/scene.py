@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mmpi_ns.field.shading import LEAST_MASS, positional_encoding
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.scene.columns import WORD
+from mmpi_ns.scene.bricks import WORD
 from mmpi_ns.scene.plan import MPIPlan
 from mmpi_show import reader
 

@@ -7,8 +7,7 @@ import json
 from pathlib import Path
 
 from mmpi_ns.ops import ends
-from mmpi_ns.ops.details import TEXT as WEIGHTS
-from mmpi_ns.rendering.details import MAX_ANGLE
+from mmpi_ns.rendering.details import MAX_ANGLE, WEIGHTS
 from mmpi_ns.utils.files import write_atomically
 from mmpi_show.files import HEADER
 

@@ -22,7 +22,7 @@ from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.march import Rays
 from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene import geometry
-from mmpi_ns.scene.columns import columns_from
+from mmpi_ns.scene.bricks import columns_from
 from mmpi_ns.scene.texels import BRICK, TexelGrid
 from mmpi_ns.scene.texels import SIDE as TILE
 from mmpi_show.ops.baked import render_baked

@@ -11,7 +11,7 @@ import torch
 from hand_made import random_mpi
 from random_fields import random_rays
 
-from mmpi_ns.scene.columns import columns_from
+from mmpi_ns.scene.bricks import columns_from
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window
 from mmpi_show.files import BakedScene, Pose

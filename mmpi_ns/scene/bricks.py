@@ -1,4 +1,4 @@
-"""Allocation, filling, growth and compaction of tables of bricks. Row arithmetic is in ``texels.py``."""
+"""Allocation, filling, growth and compaction of tables of bricks, and columns of them. Rows: ``texels.py``."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ CHUNK = 1 << 17
 """Texels of an MPI that are resampled at once: for nine channels this takes some 40 MB besides both tables."""
 AT_ONCE = 1 << 23
 """Bytes of bricks that are moved at once."""
+WORD = 32
+"""Planes of a column: bits of the occupied ones of so many consecutive planes of a tile, so that a ray skips the
+others."""
 
 
 def new_table(tiles: Int[Tensor, "T"], channels: int, empty: float = 0.0, dtype=torch.float32) -> Float[Tensor, "N C"]:
@@ -150,3 +153,26 @@ def _resize(images: Float[Tensor, "P h w C"], target: TexelGrid) -> Float[Tensor
         return out[0].permute(1, 2, 3, 0)
     size = (target.height, target.width)
     return interpolate(images.permute(0, 3, 1, 2), size=size, mode="bilinear", align_corners=True).permute(0, 2, 3, 1)
+
+
+def bits_of(masks: Int[Tensor, "N"]) -> Int[Tensor, "N 32"]:
+    """The bits of columns, lowest first."""
+    return (masks[:, None] >> torch.arange(WORD)) & 1
+
+
+def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Tensor, "B 3"]]:
+    """Columns of one MPI, and (plane, row, column) of its bricks in their order.
+
+    Args:
+        stored: bool [planes, down, across], mask of the occupied tiles.
+        first: number of bricks of earlier MPIs.
+    """
+    planes, down, across = stored.shape
+    padded = pad(stored, (0, 0, 0, 0, 0, -planes % WORD))
+    bits = padded.view(-1, WORD, down, across).permute(0, 2, 3, 1).reshape(-1, WORD)
+    masks = (bits.to(torch.int64) << torch.arange(WORD)).sum(-1)
+    counts = bits.sum(-1)
+    columns = torch.stack([torch.where(masks >= 2**31, masks - 2**32, masks), first + counts.cumsum(0) - counts], -1)
+    column, bit = bits.nonzero().unbind(-1)
+    word, place = column // (down * across), column % (down * across)
+    return columns.to(torch.int32), torch.stack([word * WORD + bit, place // across, place % across], -1)

@@ -1,4 +1,4 @@
-// Residuals of the training images near a camera (docs/details.md), as ops/details.
+// Residuals of the training images near a camera (docs/details.md), as rendering/details.py.
 uniform int seen; // training images
 uniform float seenStep, infinity; // of codes of differences; inverse distance that stands for infinity
 uniform vec4 seenImage[SEEN];  // width, height, layer, factor on weights

@@ -15,10 +15,13 @@ from nerfstudio.cameras.rays import RayBundle
 
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.model import MMPIModel
-from mmpi_ns.ops.details import HERE, LEAST_WEIGHT, MIDDLE, STRENGTH
 from mmpi_ns.rendering.details import (
+    HERE,
     LARGEST,
+    LEAST_WEIGHT,
     LEVELS,
+    MIDDLE,
+    STRENGTH,
     Details,
     DetailView,
     details_of,

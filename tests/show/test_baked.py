@@ -11,7 +11,7 @@ from random_bricks import random_window, rays_into, scene_of
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import Rays
-from mmpi_ns.scene.columns import columns_from
+from mmpi_ns.scene.bricks import columns_from
 from mmpi_show import reader
 from mmpi_show.files import write_baked
 from mmpi_show.scene import SIDE, Shader

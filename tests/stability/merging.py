@@ -12,12 +12,12 @@ import torch
 from random_scenes import Array
 from stability.cases import UNIT, Case, Outcome, Precision, compare, float32, single, tried
 
-from mmpi_ns.ops.depth_sums import depth_sums
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.variation import clamped_differences
 from mmpi_ns.sampler import merge, prune
 from mmpi_ns.scene.texels import BRICK, make_grids
 from mmpi_ns.training import losses
+from mmpi_ns.training.losses import depth_sums
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Lookups -------------------------------------------------------------------------------------------------------------

@@ -13,9 +13,9 @@ from training_runs import datamanager, plan_of, ready, trainer_config
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.composite import Composite
-from mmpi_ns.ops.depth_sums import depth_sums
 from mmpi_ns.ops.variation import clamped_differences
 from mmpi_ns.training import losses
+from mmpi_ns.training.losses import depth_sums
 
 F64 = torch.float64
 

@@ -1,5 +1,5 @@
 // Weight of a training image at the surface of a ray: head of the page's shader (mmpi_show/web.py), whose numbers Python
-// reads, too (ops/details).
+// reads, too (rendering/details.py).
 const float TURN = 0.01;        // angle of viewing directions below which weights hardly grow, radians
 const float FADE = 0.2;         // angle at which a residual fades to a half, radians
 const float SAME_DEPTH = 0.05;  // relative difference of inverse depths within which two images show one surface

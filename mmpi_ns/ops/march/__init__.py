@@ -17,7 +17,7 @@ from torch.nn.functional import pad
 
 from mmpi_ns.ops.build import OPS, call_in_parts, structs
 from mmpi_ns.ops.layout import Places, SceneLayout, Tables, dense, dense_fields
-from mmpi_ns.scene.columns import columns_from
+from mmpi_ns.scene.bricks import columns_from
 
 
 class Rays(NamedTuple):

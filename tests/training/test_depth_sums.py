@@ -1,4 +1,4 @@
-"""The sums of the depth losses against double loops in float64, and their gradients (ops/depth_sums)."""
+"""The sums of the depth losses against double loops in float64, and their gradients."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mmpi_ns.ops.depth_sums import depth_sums
+from mmpi_ns.training.losses import depth_sums
 
 HARD = {
     "random": {},

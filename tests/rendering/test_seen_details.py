@@ -1,4 +1,4 @@
-"""Details of an image at the surfaces of rays against single rays in float64 (ops/details)."""
+"""Details of an image at the surfaces of rays against single rays in float64."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from mmpi_ns.data.rays import image_rays
-from mmpi_ns.ops.details import FADE, HERE, MIDDLE, SAME_DEPTH, SAME_PIXELS, TURN, project, seen_details
+from mmpi_ns.rendering.details import FADE, HERE, MIDDLE, SAME_DEPTH, SAME_PIXELS, TURN, project, seen_details
 
 LENS = [0.08, -0.02, 0.004, 0.0, 0.003, -0.002]
 HEIGHT, WIDTH = 20, 28
@@ -130,14 +130,14 @@ def test_directions_that_a_lens_folds_back_are_outside():
     wide, image = torch.tensor([[1.8, 0.0, -1.0]]), torch.ones(HEIGHT, WIDTH, 4)
     assert 0 < 22 * 1.8 * (1 - 0.3 * 1.8**2) + 14.5 < WIDTH, "the test's direction does not fold"
     ray = torch.zeros(1, 3), torch.nn.functional.normalize(wide), torch.ones(1, 1), torch.zeros(1, 3), image
-    assert float(seen_details(*ray, numbers(cameras, reach=10.0)).weight) > 1
-    assert float(seen_details(*ray, numbers(cameras, reach=0.9)).weight) == 0
+    assert float(seen_details(*ray, numbers(cameras, reach=10.0))[1]) > 1
+    assert float(seen_details(*ray, numbers(cameras, reach=0.9))[1]) == 0
 
 
 def test_an_image_of_one_pixel_and_no_rays():
     cameras, one = numbers(camera()), torch.tensor([[[0.1, 0.2, 0.3, 0.25]]])
     ray = torch.zeros(1, 3), torch.nn.functional.normalize(torch.tensor([[-0.64, 0.4, -1.0]])), torch.full((1, 1), 0.25)
     ray = *ray, torch.full((1, 3), MIDDLE)
-    assert torch.allclose(seen_details(*ray, one, cameras).difference, one[0, :, :3])
+    assert torch.allclose(seen_details(*ray, one, cameras)[0], one[0, :, :3])
     nothing = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 1), torch.zeros(0, 3)
-    assert seen_details(*nothing, one, cameras).weight.shape == (0, 1)
+    assert seen_details(*nothing, one, cameras)[1].shape == (0, 1)
