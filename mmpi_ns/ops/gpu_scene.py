@@ -18,9 +18,6 @@ from torch import Tensor
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
-# Columns of an MPI's row in ``SceneLayout.constants``.
-ORIGIN, AXES, EXTENT, STEP, END, LAST = map(tl.constexpr, (0, 3, 12, 16, 17, 18))
-SHARE, S_SCALE, U0, U_SCALE, V0, V_SCALE, INTERVAL, FLOATS = map(tl.constexpr, range(19, 27))
 # Columns of a head's layout. BRICK_OF_TILE and TILE_OF_BRICK are the places, in the same tensor, of the brick of the
 # head's first tile and of the tile of the very first brick.
 FIRST_TILE, DEPTH, HEIGHT, WIDTH, BIAS, DOWN, ACROSS = map(tl.constexpr, range(7))
@@ -98,61 +95,6 @@ def cell(coordinate, size):
     position = tl.minimum(tl.maximum((coordinate + 1) * (0.5 * last), 0.0), last)
     lower = tl.minimum(tl.floor(position), last - 1)
     return lower.to(tl.int64), position - lower
-
-
-@triton.jit
-def bilinear(table, grids, head, plane, u, v, mask):
-    """A one-channel table at NDC (u, v) on a plane; 0 where masked."""
-    x, fx = cell(u, tl.load(grids + head * INTS + WIDTH))
-    y, fy = cell(v, tl.load(grids + head * INTS + HEIGHT))
-    a = tl.load(table + row_of(grids, head, plane, y, x, mask), mask, 0.0)
-    b = tl.load(table + row_of(grids, head, plane, y, x + 1, mask), mask, 0.0)
-    c = tl.load(table + row_of(grids, head, plane, y + 1, x, mask), mask, 0.0)
-    d = tl.load(table + row_of(grids, head, plane, y + 1, x + 1, mask), mask, 0.0)
-    return (1 - fx) * (1 - fy) * a + fx * (1 - fy) * b + (1 - fx) * fy * c + fx * fy * d
-
-
-@triton.jit
-def trilinear(table, grids, head, u, v, s, mask):
-    """A one-channel table at NDC (u, v, s), s running over planes or layers; 0 where masked."""
-    z, fz = cell(s, tl.load(grids + head * INTS + DEPTH))
-    near = bilinear(table, grids, head, z, u, v, mask)
-    return near * (1 - fz) + bilinear(table, grids, head, z + 1, u, v, mask) * fz
-
-
-@triton.jit
-def nearest(coordinate, size):
-    """Texel nearest to a coordinate in [-1, 1]; halves go to the even one, as torch.round has it."""
-    last = (size - 1).to(tl.float32)
-    position = tl.minimum(tl.maximum((coordinate + 1) * (0.5 * last), 0.0), last)
-    down = tl.floor(position)
-    odd = down - 2 * tl.floor(0.5 * down)
-    up = ((position - down > 0.5) | ((position - down == 0.5) & (odd == 1))).to(tl.float32)
-    return (down + up).to(tl.int64)
-
-
-# Arithmetic that avoids cancellation ---------------------------------------------------------
-
-
-@triton.jit
-def twice_atanh(z):
-    """log((1 + z) / (1 - z)) for |z| <= 1/3, to a few ulp."""
-    q = z * z
-    p = 1.0 / 15
-    p = p * q + 1.0 / 13
-    p = p * q + 1.0 / 11
-    p = p * q + 1.0 / 9
-    p = p * q + 1.0 / 7
-    p = p * q + 1.0 / 5
-    p = p * q + 1.0 / 3
-    return 2 * z * (p * q + 1.0)
-
-
-@triton.jit
-def softplus(x):
-    """log(1 + e^x)."""
-    y = tl.exp(-tl.abs(x))
-    return tl.maximum(x, 0.0) + twice_atanh(y / (2 + y))
 
 
 @triton.jit
