@@ -21,7 +21,7 @@ from mmpi_ns.scene.bricks import grown_tiles, move_bricks, new_table, resample, 
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
-from mmpi_ns.utils.files import to_bytes, to_text
+from mmpi_ns.scene.windows import to_bytes, to_text
 
 RELEASED_DENSITY = -20.0
 """Raw density of texels that no ray trained: their alpha is below 1e-7."""
@@ -91,24 +91,15 @@ class TexelTables(Field):
         super().__init__()
         self.feature_channels = feature_channels
         self.full_plan = self.plan = plan
-        self.factor = 1.0
+        self.factor: float
         """Fraction of the plan's texels in use: ``texel_factor`` on the host, readable without synchronising."""
         self.views = views
         self._packed: dict[Any, Any] = {}
         self.density = Table(torch.empty(0, 1))
         self.features = Table(torch.empty(0, feature_channels))
         self.reliability = Table(torch.empty(0, 1))
-        for name, dtype in (
-            ("tiles", torch.int32),
-            ("touched", torch.uint8),
-            ("peak", torch.float32),
-            ("gain", torch.float32),
-            ("plan_bytes", torch.uint8),
-        ):
-            self.register_buffer(name, torch.empty(0, dtype=dtype))
-        self.register_buffer("crossings", torch.tensor(0.0, dtype=torch.float64))
-        self.register_buffer("texel_factor", torch.tensor(1.0, dtype=torch.float64))
-        self.register_buffer("copied", torch.tensor(False))
+        for name in ("tiles", "touched", "peak", "gain", "plan_bytes", "crossings", "texel_factor", "copied"):
+            self.register_buffer(name, None)
         self.tiles: Tensor
         """Brick of every tile of all heads (``texels.py``)."""
         self.touched: Tensor
@@ -164,13 +155,10 @@ class TexelTables(Field):
             every = head_grids(self.plan)[0].tiles
             tiles = every if self.views is None else number_tiles(reachable_tiles(self.views, self.plan, device))
         self.tiles = tiles.to(device, copy=True)
-        for name in TABLES:
-            table = getattr(self, name)
-            replace_data(table, new_table(self.tiles, table.shape[1], EMPTY[name]))
+        self._change_tables(lambda table, empty: new_table(self.tiles, table.shape[1], empty))
         self.touched = torch.zeros(len(self.density), dtype=torch.uint8, device=device)
         self.plan_bytes = to_bytes(plan.to_json()).to(device)
         self.texel_factor = torch.tensor(factor, dtype=torch.float64, device=device)
-        self._packed = {}
         self.look_afresh()
 
     @torch.no_grad()
@@ -195,13 +183,10 @@ class TexelTables(Field):
         tiles = self.tiles_at(factor) if tiles is None else tiles
         old, self.plan, self.factor = self.grids, self.full_plan.scaled(factor), factor
         new = head_grids(self.plan, tiles)
-        for name in TABLES:
-            table = getattr(self, name)
-            replace_data(table, resample(table.data, old, new, EMPTY[name]))
         touched = resample(self.touched[:, None].float(), old, new)
         self.tiles, self.touched = tiles, (touched[:, 0] > 0).to(torch.uint8)
+        self._change_tables(lambda table, empty: resample(table, old, new, empty))
         self.texel_factor.fill_(factor)
-        self._packed = {}
         self.look_afresh()
 
     @torch.no_grad()
@@ -211,16 +196,21 @@ class TexelTables(Field):
         fine, kept = tiles_with_copies(grids, copies, chosen)
         mpis, copies = grids[: len(copies)], self.copy_grids(number_tiles(fine))
         remaining = self.tiles[kept].to(torch.int64)
-        for name in TABLES:
-            table = getattr(self, name)
-            finer = resample(table.data, mpis, copies, EMPTY[name])
-            replace_data(table, torch.cat([finer, move_bricks(table.data, remaining)]))
         touched = resample(self.touched[:, None].float(), mpis, copies)
         self.touched = torch.cat([(touched[:, 0] > 0).to(torch.uint8), move_bricks(self.touched, remaining)])
         self.tiles, self.plan = number_tiles(torch.cat([fine, kept])), self.plan.with_copies()
+        self._change_tables(
+            lambda table, empty: torch.cat([resample(table, mpis, copies, empty), move_bricks(table, remaining)])
+        )
         self.copied = torch.ones_like(self.copied)
-        self._packed = {}
         self.look_afresh()
+
+    def _change_tables(self, change: Callable[[Tensor, float], Tensor]) -> None:
+        """Replaces the data of every table, given with the content of its empty brick. Constants are made anew."""
+        for name in TABLES:
+            table = getattr(self, name)
+            replace_data(table, change(table.data, EMPTY[name]))
+        self._packed = {}
 
     def copy_grids(self, tiles: Int[Tensor, "S"] | None = None) -> list[TexelGrid]:
         """Texels of finer copies of the MPIs, before there are any; ``tiles``: None stores all."""
@@ -240,7 +230,8 @@ class TexelTables(Field):
     def note_use(
         self, lookup: Lookup, weights: Float[Tensor, "R S"], crossings: Int[Tensor, "R"], errors: Float[Tensor, "R"]
     ) -> None:
-        """Records the bricks of the samples of a training batch.
+        """Raises the peaks of bricks to the largest weight of a sample of a training batch that reads them, and adds
+        weights times errors to the gains of the bricks of first texels, in the order of samples.
 
         Args:
             lookup: of the samples in the tables.
@@ -248,8 +239,14 @@ class TexelTables(Field):
             crossings: number of samples of each ray before pruning.
             errors: squared errors of the rays' colours, 0 where a ray has none.
         """
-        gain = self.gain if self.num_copies == 0 else None
-        note_use(lookup.rows, lookup.taps, lookup.index, weights, errors, self.peak, gain)
+        of_samples, bricks = weights.reshape(-1).index_select(0, lookup.index), lookup.rows >> 6
+        shares = of_samples * errors.index_select(0, lookup.index // weights.shape[1])
+        sizes = [len(each.positions) for each in lookup.taps]
+        for each, weight, share in zip(lookup.taps, of_samples.split(sizes), shares.split(sizes), strict=True):
+            read = bricks.index_select(0, each.positions.reshape(-1))
+            self.peak.scatter_reduce_(0, read, weight.repeat_interleave(each.positions.shape[1]), "amax")
+            if self.num_copies == 0:
+                self.gain.index_add_(0, bricks.index_select(0, each.positions[:, 0]), share)
         self.crossings += crossings.sum()
 
     @torch.no_grad()
@@ -269,7 +266,7 @@ class TexelTables(Field):
         """Resets the records on the use of bricks."""
         self.peak = torch.zeros(self.num_bricks + 1, device=self.density.device)
         self.gain = torch.zeros_like(self.peak)
-        self.crossings = torch.zeros_like(self.crossings)
+        self.crossings = torch.zeros((), dtype=torch.float64, device=self.density.device)
 
     @torch.no_grad()
     def release_untouched(self) -> Int[Tensor, "K"] | None:
@@ -285,11 +282,8 @@ class TexelTables(Field):
         if len(kept) == len(keep):
             return None
         self.tiles = numbers[self.tiles.to(torch.int64)].to(torch.int32)
-        for name in TABLES:
-            table = getattr(self, name)
-            replace_data(table, move_bricks(table.data, kept))
+        self._change_tables(lambda table, _: move_bricks(table, kept))
         self.touched, self.peak, self.gain = move_bricks(self.touched, kept), self.peak[kept], self.gain[kept]
-        self._packed = {}
         return kept
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
@@ -304,38 +298,6 @@ class TexelTables(Field):
         self.build(plan, float(state_dict[prefix + "texel_factor"]), state_dict[prefix + "tiles"], copied)
         self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as written, even if plans have other fields now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-def note_use(
-    rows: Int[Tensor, "U"],
-    taps: list[Taps],
-    slots: Int[Tensor, "N"],
-    weights: Float[Tensor, "R S"],
-    errors: Float[Tensor, "R"],
-    peak: Float[Tensor, "B"],
-    gain: Float[Tensor, "B"] | None,
-) -> None:
-    """Raises the peaks of bricks to the largest weight of a sample that reads them, and adds weights times errors to
-    the gains of the bricks of first texels, in the order of samples.
-
-    Args:
-        rows: of the tables, each once and rising.
-        taps: of the samples, those on planes first; positions are among ``rows``.
-        slots: flat slot of each sample in ``weights``.
-        weights: of the samples.
-        errors: of the rays.
-        peak: of the bricks, changed in place.
-        gain: likewise; None: is not recorded.
-    """
-    of_samples, bricks = weights.reshape(-1).index_select(0, slots), rows >> 6
-    sizes = [len(each.positions) for each in taps]
-    for each, weight in zip(taps, of_samples.split(sizes), strict=True):
-        read = bricks.index_select(0, each.positions.reshape(-1))
-        peak.scatter_reduce_(0, read, weight.repeat_interleave(each.positions.shape[1]), "amax")
-    if gain is not None:
-        shares = of_samples * errors.index_select(0, slots // weights.shape[1])
-        for each, share in zip(taps, shares.split(sizes), strict=True):
-            gain.index_add_(0, bricks.index_select(0, each.positions[:, 0]), share)
 
 
 def replace_data(parameter: nn.Parameter, data: Tensor) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mmpi_ns.scene.plan import HUGE, LENGTH, ScenePlan, Vector, check_fields, read_object
@@ -132,3 +132,13 @@ def window_shares(origins: Float[Tensor, "R 3"], windows: tuple[Window, ...]) ->
     nearest = torch.nn.functional.one_hot(beyond.argmin(-1), len(windows)).to(counts)
     counts = torch.where(counts.sum(-1, keepdim=True) > 0, counts, nearest)
     return (counts / counts.sum(-1, keepdim=True)).to(origins.dtype)
+
+
+def to_bytes(text: str) -> UInt8[Tensor, "B"]:
+    """Text as a buffer of a module."""
+    return torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
+
+
+def to_text(data: UInt8[Tensor, "B"]) -> str:
+    """Inverse of ``to_bytes``."""
+    return bytes(data.cpu().numpy().tolist()).decode()

@@ -17,10 +17,10 @@ from torch.optim import Optimizer
 
 from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.scene.windows import WindowedPlan, to_text
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import InputError, brief, quoted
-from mmpi_ns.utils.files import to_text, write_errors
+from mmpi_ns.utils.files import write_errors
 from mmpi_ns.utils.pages import all_zero
 
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "rays", "capture"}

@@ -23,12 +23,11 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.placement.split import cameras_of
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.scene.windows import Window, WindowedPlan
+from mmpi_ns.scene.windows import Window, WindowedPlan, to_bytes, to_text
 from mmpi_ns.training.initial import start_from_depths
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.training.reliability import TRAINS, prepare_parameters
 from mmpi_ns.training.storage import prepare_storage
-from mmpi_ns.utils.files import to_bytes, to_text
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Atomic files, images that may be damaged, arrays on disk, and text in a checkpoint."""
+"""Atomic files, images that may be damaged, and arrays on disk."""
 
 from __future__ import annotations
 
@@ -9,17 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from mmpi_ns.utils.errors import InputError, WriteError, brief
-
-if TYPE_CHECKING:
-    from jaxtyping import UInt8
-    from torch import Tensor
 
 Arrays = Mapping[str, NDArray[np.generic]]
 Pairs = Iterable[tuple[str, NDArray[np.generic]]]
@@ -104,18 +99,6 @@ def make_writable(folder: Path, option: str) -> None:
 def cache_folder() -> Path:
     """``$XDG_CACHE_HOME/mmpi_ns``, by default in ``~/.cache``: the cache of computed and compiled results."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
-
-
-def to_bytes(text: str) -> UInt8[Tensor, "B"]:
-    """Text as a buffer of a module."""
-    import torch  # takes seconds, and most callers do not need it
-
-    return torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
-
-
-def to_text(data: UInt8[Tensor, "B"]) -> str:
-    """Inverse of ``to_bytes``."""
-    return bytes(data.cpu().numpy().tolist()).decode()
 
 
 def write_arrays(path: Path, arrays: Arrays | Pairs) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 from compiled import normal
 
-from mmpi_ns.field.tables import note_use
+from mmpi_ns.field.tables import TexelTables
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import index_rows
 from mmpi_ns.scene.texels import BRICK
@@ -17,8 +18,8 @@ BRICKS, RAYS, SLOTS = 40, 90, 11
 
 
 def use(of_planes, of_cube=(), seed=0):
-    """Arguments of ``note_use``, of samples that read these rows of tables, in slots that rise among the planes and
-    again in the cube."""
+    """Rows, taps, slots, weights, errors, peaks and gains of samples that read these rows of tables, in slots that rise
+    among the planes and again in the cube."""
     g = torch.Generator().manual_seed(seed)
     groups = [torch.as_tensor(x) for x in (of_planes, of_cube) if len(x)]
     order = torch.randperm(RAYS * SLOTS, generator=g)[: sum(map(len, groups))]
@@ -67,9 +68,11 @@ CASES = {
 
 def noted(arguments):
     """Peaks and gains afterwards."""
-    records = [x.clone() for x in arguments[5:]]
-    note_use(*arguments[:5], *records)
-    return records
+    rows, taps, slots, weights, errors, *records = arguments
+    peak, gain = (x.clone() for x in records)
+    field = SimpleNamespace(peak=peak, gain=gain, num_copies=0, crossings=0)
+    TexelTables.note_use(field, SimpleNamespace(rows=rows, taps=taps, index=slots), weights, weights[:, 0], errors)
+    return [peak, gain]
 
 
 @pytest.mark.parametrize("case", CASES)
