@@ -56,7 +56,7 @@ class Solids:
 def bake(solids: Solids, mpis: list[MPIPlan]) -> MMPIField:
     """A field whose texels hold density and colour of the solids at the points where they lie. No training."""
     plan = ScenePlan(tuple(mpis), None, 0.05, 1.0)
-    field = MMPIField(plan, feature_channels=3, hidden_width=4, position_frequencies=0, direction_frequencies=0).eval()
+    field = MMPIField(plan, feature_channels=3, hidden_width=4).eval()
     for mpi, grid in zip(mpis, field.grids, strict=True):
         u, v = np.linspace(*mpi.extent[:2], mpi.width), np.linspace(*mpi.extent[2:], mpi.height)
         rays = np.stack([*np.meshgrid(u, v), np.ones((mpi.height, mpi.width))], -1) @ np.array(mpi.axes)

@@ -15,14 +15,7 @@ from torch import Tensor
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.ops.march import Rays
-from mmpi_ns.scene.geometry import (
-    Frames,
-    LocalRays,
-    PlaneHits,
-    inverse_distance,
-    local_to_ndc,
-    sample_disparity,
-)
+from mmpi_ns.scene.geometry import Frames, LocalRays, PlaneHits, inverse_distance, local_to_ndc, sample_disparity
 from mmpi_ns.scene.texels import TexelGrid
 
 Texels = tuple[Int[Tensor, "N T"], Float[Tensor, "N T"]]

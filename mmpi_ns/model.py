@@ -34,7 +34,7 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.settings import MMPIModelConfig, PlacementConfig
 from mmpi_ns.training.checkpoints import last_checkpoint
 from mmpi_ns.training.losses import batch_losses, over_background
-from mmpi_ns.training.memory import Work, check_memory
+from mmpi_ns.training.memory import check_memory, texel_bytes
 from mmpi_ns.training.phases import make_schedule
 from mmpi_ns.training.reliability import assign_heads, blends_in
 from mmpi_ns.training.run import Progress, TrainingRun, move_rays, views_of
@@ -61,8 +61,8 @@ class MMPIModel(Model):
         # A single head always trains alone.
         joint = config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
         if capture is not None:
-            work = Work(config.colour.feature_channels, two_phase=not joint)
-            check_memory(windows, lambda window: views_of(window, views), work, device)
+            per_texel = texel_bytes(config.colour.feature_channels, two_phase=not joint)
+            check_memory(windows, lambda window: views_of(window, views), per_texel, device)
         phases = replace(config.schedule, training="joint" if joint else "two-phase")
         count = len(windows)
         schedule = make_schedule(phases, max(1, config.total_steps), count, capture is not None and capture.has_depths)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.utils.errors import InputError, brief, looked_at
 from mmpi_ns.utils.files import opened
-from mmpi_ns.utils.values import Number, as_text, check_number, cut
+from mmpi_ns.utils.values import Number, as_text, check_number, check_text, cut
 
 FLOAT64_SAME = 1e-12
 """Cameras of a file closer together than this fraction of their distance from the origin count as one place."""
@@ -56,20 +56,16 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, *, opens: b
             raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
         copy = path.parent / f"images_{factor}" / first.name
         if factor > 1 and not copy.is_file():
+            copies = sorted(folder.name for folder in path.parent.glob("images_*") if folder.is_dir())
             raise InputError(
                 f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give "
-                f"another --downscale-factor (there are {names_of_copies(path.parent)})."
+                f"another --downscale-factor (there are {', '.join(copies) or 'no copies'})."
             )
     elif opens:
         with opened(first):
             pass
     names = [frame["file_path"] for frame in frames]
     check_places(poses[:, :3, 3], names, path, "nerfstudio-data", auto_scale=parser.auto_scale_poses)
-
-
-def names_of_copies(folder: Path) -> str:
-    """Names of a capture's folders of downscaled copies, as text."""
-    return ", ".join(sorted(p.name for p in folder.glob("images_*") if p.is_dir())) or "no copies"
 
 
 @cache
@@ -108,9 +104,7 @@ def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
             if key not in frame:
                 name = cut(str(frame.get("file_path", f"number {i + 1}")))
                 raise InputError(f"Frame {name} of {path} has no {key}: add it or remove the frame.")
-        if not isinstance(frame["file_path"], str) or not frame["file_path"].strip():
-            said = as_text(frame["file_path"])
-            raise InputError(f"The file_path of frame number {i + 1} of {path} is {said}: give the path of a file.")
+        check_text(f"The file_path of frame number {i + 1} of {path}", frame["file_path"])
     return meta, frames
 
 

@@ -111,7 +111,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def create_train_dataset(self) -> MMPIDataset:
         # First, so that errors of images are reported before minutes of matching.
-        self._test_images = self._test_dataset()
+        outputs, scale = self.dataparser.get_dataparser_outputs(self.test_split), self.config.camera_res_scale_factor
+        self._test_images = self.dataset_type(fit_cameras(outputs, self._downscale_factor), scale_factor=scale)
         fit_cameras(self.train_dataparser_outputs, self._downscale_factor)
         self.train_dataset = dataset = super().create_train_dataset()
         if not len(dataset):
@@ -154,11 +155,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def _downscale_factor(self) -> int | None:
         """Downscale factor of the images that the data parser has listed."""
         return getattr(self.dataparser, "downscale_factor", None) or getattr(self.dataparser, "_downscale_factor", None)
-
-    def _test_dataset(self) -> MMPIDataset:
-        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
-        scale = self.config.camera_res_scale_factor
-        return self.dataset_type(fit_cameras(outputs, self._downscale_factor), scale_factor=scale)
 
     def create_eval_dataset(self) -> MMPIDataset:
         if count := len(self._test_images):

@@ -65,9 +65,8 @@ class PixelPool:
         places = None if whole else torch.empty(room, dtype=torch.int32)
         depths = None if depth_priors is None else torch.empty(room, 2, dtype=torch.int16)
         starts = [0]
-        for i, (image, kept) in zip(
-            images, in_order(lambda i: _pixels_of(dataset, i, share, seed), images), strict=True
-        ):
+        read = in_order(lambda i: _pixels_of(dataset, i, share, seed), images)
+        for i, (image, kept) in zip(images, read, strict=True):
             starts.append(starts[-1] + len(kept))
             rows = slice(*starts[-2:])
             colors[rows, : image.shape[1]] = image[kept]
@@ -75,9 +74,8 @@ class PixelPool:
             if places is not None:
                 places[rows] = kept.int()
             if depths is not None and depth_priors is not None:
-                depths[rows] = torch.from_numpy(np.require(depth_priors.codes[i], requirements="W")).reshape(-1, 2)[
-                    kept
-                ]
+                codes = torch.from_numpy(np.require(depth_priors.codes[i], requirements="W"))
+                depths[rows] = codes.reshape(-1, 2)[kept]
         if not starts[-1]:
             raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
         rows = slice(starts[-1])

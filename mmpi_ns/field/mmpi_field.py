@@ -43,8 +43,6 @@ class MMPIField(TexelTables):
     Args:
         plan: frames and resolutions.
         shading: with the next two, see ``ColourConfig``.
-        position_frequencies: octaves of the positional encoding of NDC positions, where samples are shaded.
-        direction_frequencies: octaves of the positional encoding of directions.
         shares_depth: K MPIs train jointly from the start, so each has 1/K of the optical depth.
         learns_reliability: training has a phase of reliability (``training/reliability.py``).
         samples_per_voxel: samples along a ray per voxel side of the cube.
@@ -60,8 +58,6 @@ class MMPIField(TexelTables):
         shading: Shading = "sample",
         feature_channels: int = 9,
         hidden_width: int = 64,
-        position_frequencies: int = POSITION_FREQUENCIES,
-        direction_frequencies: int = DIRECTION_FREQUENCIES,
         shares_depth: bool = False,
         learns_reliability: bool = False,
         samples_per_voxel: float = 1.0,
@@ -79,9 +75,9 @@ class MMPIField(TexelTables):
         self.shading = shading
         sizes = (feature_channels, hidden_width)
         if shading == "ray":
-            self.networks = RayShader(1, *sizes, direction_frequencies)
+            self.networks = RayShader(1, *sizes, DIRECTION_FREQUENCIES)
         else:
-            self.networks = ColorNetworks(plan.num_heads, *sizes, position_frequencies, direction_frequencies)
+            self.networks = ColorNetworks(plan.num_heads, *sizes, POSITION_FREQUENCIES, DIRECTION_FREQUENCIES)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes the number of colour networks from the checkpoint first."""

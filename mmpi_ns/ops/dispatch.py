@@ -49,11 +49,7 @@ class Operation(Generic[P, R]):
     """
 
     def __init__(
-        self,
-        reference: Callable[P, R],
-        compiled: tuple[Form, ...],
-        in_cpp: int | None,
-        kernels: str | None = None,
+        self, reference: Callable[P, R], compiled: tuple[Form, ...], in_cpp: int | None, kernels: str | None
     ) -> None:
         functools.update_wrapper(self, reference)
         self.reference, self.compiled = reference, list(compiled)

@@ -8,8 +8,6 @@ differentiated instead, which holds for any pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,29 +18,14 @@ WORST = 64.0
 """Error of an observation that no head contains, and upper bound on all errors, pixels."""
 
 
-@dataclass(frozen=True)
-class PixelErrors:
-    """Errors of Q observations in K heads (MPIs, then the cube); inf if the head does not contain the point."""
-
-    plane: Array
-    """[Q, K] e_p: half a plane spacing, in pixels."""
-    texel: Array
-    """[Q, K] e_t: the pixels that a texel spans along its longer side."""
-
-    @property
-    def combined(self) -> Array:
-        """[Q, K] hypot of e_p and half of e_t: a sample is displaced by at most e_p and half a texel."""
-        return np.hypot(self.plane, 0.5 * self.texel)
-
-
-def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> PixelErrors:
-    """e_p and e_t of observed points [Q, 3], each seen by a camera [Q], in every head of a plan: its MPIs, then the
-    cube if there is one."""
-    pairs = [mpi_errors(m, observations, cameras, points) for m in plan.mpis]
+def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> Array:
+    """Errors [Q, K] of observed points [Q, 3], each seen by a camera [Q], in every head of a plan: its MPIs, then the
+    cube if there is one. A sample is displaced by at most e_p and half a texel: hypot of both; inf outside the head."""
+    of_mpis = (mpi_errors(mpi, observations, cameras, points) for mpi in plan.mpis)
+    errors = [np.hypot(plane, 0.5 * texel) for plane, texel in of_mpis]
     if plan.cube is not None:
-        texel = cube_errors(plan.cube, observations, cameras, points)
-        pairs.append((np.where(np.isfinite(texel), 0.0, np.inf), texel))
-    return PixelErrors(np.stack([p for p, _ in pairs], -1), np.stack([t for _, t in pairs], -1))
+        errors.append(0.5 * cube_errors(plan.cube, observations, cameras, points))
+    return np.stack(errors, -1)
 
 
 def mpi_errors(

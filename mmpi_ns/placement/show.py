@@ -21,7 +21,7 @@ def table(plan: ScenePlan, observations: Observations) -> str:
     """Shares and expected errors of every head, over the weighted observations, as a Markdown table, and a line about
     the whole."""
     visible = find_visible_points(observations)
-    errors = pixel_errors(plan, observations, visible.cameras, visible.points).combined
+    errors = pixel_errors(plan, observations, visible.cameras, visible.points)
     combined, weights = np.minimum(errors, WORST), visible.weights / visible.weights.sum()
     held, best = np.isfinite(errors), errors.argmin(-1)
     lines = [

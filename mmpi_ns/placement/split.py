@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from mmpi_ns.placement.candidates import vector
 from mmpi_ns.placement.observations import Array, Observations, farthest_first, find_visible_points
 from mmpi_ns.placement.rule import place
+from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.settings import PlacementConfig
 
@@ -24,14 +25,6 @@ ROUNDS = 50
 """Rounds of moving windows to the centres of their cameras."""
 
 
-class Ball(NamedTuple):
-    """A window without its plan."""
-
-    center: Array
-    radius: float
-    margin: float
-
-
 def place_windows(
     observations: Observations, config: PlacementConfig, training_rays: int | None = None
 ) -> WindowedPlan:
@@ -40,12 +33,9 @@ def place_windows(
     balls = find_balls(observations, config.window_length)
     if len(balls) < 2:
         return WindowedPlan.single(place(observations, config, training_rays))
-    windows = []
-    for ball in balls:
-        observed = of_cameras(observations, cameras_of(ball, observations.centers))
-        center = tuple(ball.center.tolist())
-        windows.append(Window(center, ball.radius, ball.margin, place(observed, config, training_rays)))
-    return WindowedPlan(tuple(windows))
+    observed = (of_cameras(observations, cameras_of(ball, observations.centers)) for ball in balls)
+    plans = (place(each, config, training_rays) for each in observed)
+    return WindowedPlan(tuple(replace(ball, plan=plan) for ball, plan in zip(balls, plans, strict=True)))
 
 
 def most_pixels(observations: Observations, config: PlacementConfig) -> float:
@@ -56,8 +46,8 @@ def most_pixels(observations: Observations, config: PlacementConfig) -> float:
     return float(max((pixels[cameras].sum() for cameras in windows), default=pixels.sum()))
 
 
-def find_balls(observations: Observations, length: float) -> list[Ball]:
-    """The balls of the windows, in order along the path; independent of the cameras' order. ``length`` is the maximum
+def find_balls(observations: Observations, length: float) -> list[Window]:
+    """The windows without plans, in order along the path; independent of the cameras' order. ``length`` is the maximum
     of a window, in median distances of the content; 0 for no windows."""
     if length <= 0:
         return []
@@ -92,10 +82,10 @@ def find_balls(observations: Observations, length: float) -> list[Ball]:
         order.append(min(left, key=lambda i: float(np.linalg.norm(middles[i] - at))))
         left.remove(order[-1])
         at = middles[order[-1]]
-    return [Ball(middles[i], radii[i], MARGIN * longest) for i in order]
+    return [Window(vector(middles[i]), radii[i], MARGIN * longest, NO_PLAN) for i in order]
 
 
-def cameras_of(window: Window | Ball, centers: Array) -> NDArray[np.int64]:
+def cameras_of(window: Window, centers: Array) -> NDArray[np.int64]:
     """Cameras with a share in a window, which its placement and training use; all cameras if there is only one."""
     distance = np.linalg.norm(centers - np.asarray(window.center), axis=-1)
     return np.nonzero(distance < window.radius + window.margin)[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -24,8 +25,6 @@ class ImageMetrics:
     """Metrics of a rendered image. LPIPS downloads its weights on first use and is omitted without them."""
 
     lpips_net: Literal["vgg", "alex", "none"]
-    _lpips: nn.Module | None = None
-    _lpips_tried: bool = False
 
     @torch.no_grad()
     def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
@@ -33,22 +32,25 @@ class ImageMetrics:
 
         corrected = color_correct(predicted.float(), observed.float())  # as in nerfstudio's splatfacto
         values = psnr_and_ssim(predicted, observed) | {"cc_psnr": psnr(corrected, observed)}
-        if self.lpips_net != "none" and not self._lpips_tried:
-            self._lpips_tried = True
-            try:
-                from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-                metric = LearnedPerceptualImagePatchSimilarity(net_type=self.lpips_net, normalize=True)
-                self._lpips = metric.to(predicted.device)
-            except (OSError, RuntimeError, ImportError) as error:
-                CONSOLE.print(
-                    f"[yellow]LPIPS is left out: the weights of its {self.lpips_net} network are not "
-                    f"available ({type(error).__name__}). Put them into torch's hub cache to get it."
-                )
         if self._lpips is not None:
             a, b = (torch.moveaxis(x, -1, 0)[None].float().clamp(0, 1) for x in (predicted, observed))
-            values[f"lpips_{self.lpips_net}"] = float(self._lpips(a, b))
+            values[f"lpips_{self.lpips_net}"] = float(self._lpips.to(a.device)(a, b))
         return values
+
+    @cached_property
+    def _lpips(self) -> nn.Module | None:
+        if self.lpips_net == "none":
+            return None
+        try:
+            from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+            return LearnedPerceptualImagePatchSimilarity(net_type=self.lpips_net, normalize=True)
+        except (OSError, RuntimeError, ImportError) as error:
+            CONSOLE.print(
+                f"[yellow]LPIPS is left out: the weights of its {self.lpips_net} network are not "
+                f"available ({type(error).__name__}). Put them into torch's hub cache to get it."
+            )
+            return None
 
 
 def psnr_and_ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:

@@ -62,12 +62,7 @@ class MMPIPipeline(VanillaPipeline):
         return values, images
 
     def score(self, camera: Cameras, batch: dict[str, Tensor]) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics and pictures of one image.
-
-        Args:
-            camera: of the image.
-            batch: the image, from the data set, with ``image_idx``.
-        """
+        """Metrics and pictures of an image, by its camera and its batch from the data set."""
         model: Any = self.model
         return model.get_image_metrics_and_images(self.outputs_of(camera, batch)[0], batch)
 

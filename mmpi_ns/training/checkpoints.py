@@ -54,7 +54,9 @@ def last_checkpoint(folder: Path) -> Path:
     """The checkpoint of the latest step in a folder. Raises InputError if there is none."""
     steps = checkpoints_in(folder)
     if not steps:
-        raise InputError(f"There is no checkpoint in {folder} to load: train first, or put it back.")
+        raise InputError(
+            f"There is no checkpoint in {folder}: it must be the nerfstudio_models folder of a run that trained."
+        )
     return steps[max(steps)]
 
 
@@ -67,13 +69,10 @@ def checkpoint_to_load(config: TrainerConfig) -> Path | None:
         return path
     if config.load_dir is None:
         return None
-    steps = checkpoints_in(config.load_dir)
-    if not steps:
-        raise InputError(f"There is no checkpoint in {config.load_dir}: give the nerfstudio_models folder.")
-    step = config.load_step if config.load_step is not None else max(steps)
-    if step not in steps:
+    last, step, steps = last_checkpoint(config.load_dir), config.load_step, checkpoints_in(config.load_dir)
+    if step is not None and step not in steps:
         raise InputError(f"There is no step {step} in {config.load_dir}: it holds {sorted(steps)}.")
-    return steps[step]
+    return last if step is None else steps[step]
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 
@@ -19,25 +18,24 @@ LEAST_SHARE = 0.02
 """Fraction of a plan's texels assumed to be in reach of training rays; computing it takes time."""
 
 
-@dataclass(frozen=True)
-class Work:
-    """Settings of a training that determine its memory, besides the plan."""
-
-    feature_channels: int
-    """Colour features of a texel."""
-    two_phase: bool
-    """Whether reliability is trained, so that it has moments."""
+def texel_bytes(feature_channels: int, two_phase: bool) -> int:
+    """Bytes of a stored texel in the tables and moments; ``two_phase``: reliability is trained, so it has moments."""
+    numbers, learned = 1 + feature_channels + 1, 1 + feature_channels + two_phase  # density, features, reliability
+    return 4 * numbers + 2 * 2 * learned + 1  # in float32, in bfloat16, and whether a training ray read it
 
 
 def check_memory(
-    windows: WindowedPlan, views_of: Callable[[Window], TrainingViews | None], work: Work, device: str | torch.device
+    windows: WindowedPlan,
+    views_of: Callable[[Window], TrainingViews | None],
+    per_texel: int,
+    device: str | torch.device,
 ) -> None:
     """Raises InputError if not enough memory is free on a device to train a window, before anything is allocated."""
     for window in windows.windows:
         plan = window.plan
-        free, needed = free_memory(device), training_bytes(plan, None, work)
+        free, needed = free_memory(device), training_bytes(plan, None, per_texel)
         if LEAST_SHARE * needed <= free < needed:  # texels that no ray reaches are not stored
-            needed = training_bytes(plan, views_of(window), work, device)
+            needed = training_bytes(plan, views_of(window), per_texel, device)
         if needed > free:
             fitting = 0.95 * plan.texels * free / needed
             raise InputError(
@@ -47,21 +45,20 @@ def check_memory(
             )
 
 
-def training_bytes(plan: ScenePlan, views: TrainingViews | None, work: Work, device: str | torch.device = "cpu") -> int:
+def training_bytes(
+    plan: ScenePlan, views: TrainingViews | None, per_texel: int, device: str | torch.device = "cpu"
+) -> int:
     """Bytes of the tables of one window at full resolution, and of their moments, before bricks are released. Texels
     that none of ``views`` can reach are not stored (None: all are); ``device`` computes which."""
     tiles = sum(depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in head_shapes(plan))
     stored = tiles if views is None else int(reachable_tiles(views, plan, device).sum())
-    return stored_bytes(stored, tiles, work)
+    return stored_bytes(stored, tiles, per_texel)
 
 
-def stored_bytes(bricks: int, tiles: int, work: Work) -> int:
+def stored_bytes(bricks: int, tiles: int, per_texel: int) -> int:
     """Bytes of tables with a number of bricks besides the empty one, and of their moments; ``tiles`` are those of all
     planes, stored or not."""
-    learned = 1 + work.feature_channels + work.two_phase
-    numbers, moments = 1 + work.feature_channels + 1, 2 * learned  # density, features, reliability; float32, bfloat16
-    # Plus masks of touched texels, peaks and gains of bricks, and the tile map.
-    return (bricks + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 8) + 4 * tiles
+    return (bricks + 1) * (BRICK * per_texel + 8) + 4 * tiles  # with peaks and gains of bricks, and the tile map
 
 
 def describe(windows: WindowedPlan, steps: int, held: int) -> str:

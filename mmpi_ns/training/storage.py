@@ -15,7 +15,7 @@ from mmpi_ns.field.tables import TABLES, TexelTables
 from mmpi_ns.scene.bricks import tiles_with_copies
 from mmpi_ns.scene.plan import FINER, MOST_TEXELS
 from mmpi_ns.scene.texels import head_shapes
-from mmpi_ns.training.memory import Work, stored_bytes, training_bytes
+from mmpi_ns.training.memory import stored_bytes, texel_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.training.reliability import release_untrained
 from mmpi_ns.utils.errors import log
@@ -59,24 +59,24 @@ def prepare_storage(
         for optimizer, table in trained if kept is not None else ():
             optimizer.keep_bricks(table, kept)
     if schedule.refines_at(step) and field.num_copies == 0:
-        work = Work(field.feature_channels, two_phase=not schedule.is_joint)
-        budget = training_bytes(field.full_plan, field.views, work, field.density.device)
+        per_texel = texel_bytes(field.feature_channels, two_phase=not schedule.is_joint)
+        budget = training_bytes(field.full_plan, field.views, per_texel, field.density.device)
         if gain is not None and schedule.is_joint and field.full_plan.may_be_copied(field.factor):
-            copy_finely(field, gain, work, budget, trained)
+            copy_finely(field, gain, per_texel, budget, trained)
         else:
-            refine(field, work, budget, trained)
+            refine(field, per_texel, budget, trained)
 
 
-def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any, Any]]) -> None:
+def refine(field: TexelTables, per_texel: int, budget: int, trained: list[tuple[Any, Any]]) -> None:
     """Makes texels finer than planned where bricks were released: as fine as the plan allows within ``ROOM`` of
     ``budget`` bytes of tables and moments. ``trained`` are optimisers and their tables."""
     plan, budget = field.full_plan, int(ROOM * budget)
-    needed = stored_bytes(field.num_bricks, len(field.tiles), work)
+    needed = stored_bytes(field.num_bricks, len(field.tiles), per_texel)
     longest = max(n for shape in head_shapes(plan) for n in shape[1:])
     factor = min(plan.detail, (MOST_TEXELS / longest) ** 2, field.factor * budget / needed)
     while factor >= WORTH * field.factor:
         tiles = field.tiles_at(factor)
-        needed = stored_bytes(int((tiles > 0).sum()), len(tiles), work)
+        needed = stored_bytes(int((tiles > 0).sum()), len(tiles), per_texel)
         if needed <= budget:
             for optimizer, table in trained:
                 optimizer.state.pop(table, None)
@@ -89,7 +89,7 @@ def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any,
 
 
 def copy_finely(
-    field: TexelTables, gain: Float[Tensor, "B"], work: Work, budget: int, trained: list[tuple[Any, Any]]
+    field: TexelTables, gain: Float[Tensor, "B"], per_texel: int, budget: int, trained: list[tuple[Any, Any]]
 ) -> None:
     """Makes finer copies of the bricks in which training rays have the largest errors (``TexelTables.gain``), and of
     adjacent ones, if there are none yet. Arguments are those of ``refine``."""
@@ -109,7 +109,7 @@ def copy_finely(
             wide[here] |= (max_pool2d(images, 3, 1, 1) > 0).reshape(-1)
         wide &= field.tiles > 0
         fine, kept = tiles_with_copies(grids, copies, wide)
-        needed = stored_bytes(int(fine.sum()) + int(kept.sum()), len(fine) + len(kept), work)
+        needed = stored_bytes(int(fine.sum()) + int(kept.sum()), len(fine) + len(kept), per_texel)
         return wide, needed <= budget
 
     # More bricks nearly always take more room. The number taken fits, whether or not a few more would.

@@ -38,7 +38,7 @@ from mmpi_ns.training.checkpoints import (
     states_of,
 )
 from mmpi_ns.training.frames import FrameTurns
-from mmpi_ns.training.memory import Work, describe, training_bytes
+from mmpi_ns.training.memory import describe, texel_bytes, training_bytes
 from mmpi_ns.training.report import TrainingLog, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, views_of
 from mmpi_ns.training.step_graph import StepGraphs
@@ -113,8 +113,8 @@ class MMPITrainer(Trainer):
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
         run, manager, windows = self._run, self._manager, plan.windows
-        work = Work(run.field.feature_channels, not run.progress.schedule.is_joint)
-        held = max(training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows)
+        per_texel = texel_bytes(run.field.feature_channels, not run.progress.schedule.is_joint)
+        held = max(training_bytes(w.plan, views_of(w, run.views), per_texel, self.device) for w in windows)
         log(manager.describe())
         log(describe(plan, self._window_steps, held))
         if self._follows_capture:

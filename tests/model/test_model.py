@@ -15,6 +15,7 @@ from training_runs import ready, trainer_config, write_plan
 
 import mmpi_ns.model
 from mmpi_ns.config import mmpi_small
+from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.training.phases import TRAINS
 
 KINDS = ("density", "features", "colour", "reliability")
@@ -255,8 +256,7 @@ def test_lpips_is_left_out_with_a_message_where_its_weights_are_not_available(
         raise error
 
     monkeypatch.setattr(torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", refuse)
-    monkeypatch.setattr(model.metrics, "_lpips_tried", False)
-    monkeypatch.setattr(model.metrics, "_lpips", None)
+    monkeypatch.setattr(model, "metrics", ImageMetrics(model.metrics.lpips_net))
     camera, batch = trained.pipeline.datamanager.next_eval_image(0)
     outputs = model.get_outputs_for_camera(camera)
     for _ in range(2):

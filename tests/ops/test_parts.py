@@ -18,12 +18,12 @@ COUNT = 1000
 
 
 def taken(parts, seed=0):
-    """Whether samples in all slots are numbered right, in so many parts."""
-    slots = torch.randperm(COUNT, generator=torch.Generator().manual_seed(seed))
-    numbers, chosen = torch.full((COUNT,), -1, dtype=torch.int32), torch.ones(COUNT, dtype=torch.bool)
+    """Whether all rows are read right, in so many parts."""
+    rows = torch.randperm(COUNT, generator=torch.Generator().manual_seed(seed), dtype=torch.int32)
+    table, values = torch.arange(COUNT).float(), torch.full((COUNT,), -1.0)
     bounds = [COUNT * i // parts for i in range(parts + 1)]
-    build.call_in_parts("mmpi_number_samples", bounds, slots, chosen, 1, numbers)
-    return torch.equal(numbers.long(), slots.argsort())
+    build.call_in_parts("mmpi_weighted_rows", bounds, table, rows, torch.ones(COUNT), COUNT, 1, COUNT, 1, values)
+    return torch.equal(values, rows.float())
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 8])

@@ -75,12 +75,12 @@ def test_windows_hold_every_camera_are_no_longer_than_asked_and_grow_with_the_ro
     for length in (200, 400, 800):
         seen = road(length)
         balls = find_balls(seen, 4.0)
-        distance = np.stack([np.linalg.norm(seen.centers - c, axis=-1) for c, _, _ in balls], -1)
-        radii = np.array([r for _, r, _ in balls])
+        distance = np.stack([np.linalg.norm(seen.centers - ball.center, axis=-1) for ball in balls], -1)
+        radii = np.array([ball.radius for ball in balls])
         assert (distance <= radii + 1e-9).any(-1).all()
         median = np.median(np.linalg.norm(seen.points - seen.centers[seen.seen_by], axis=-1))
         assert radii.max() < 0.75 * 4.0 * median
-        order = np.array([c for c, _, _ in balls])[:, 0]
+        order = np.array([ball.center for ball in balls])[:, 0]
         assert (np.diff(order) > 0).all() or (np.diff(order) < 0).all()  # along the road
         counts.append(len(balls))
     assert counts[0] >= 3
@@ -90,9 +90,9 @@ def test_windows_hold_every_camera_are_no_longer_than_asked_and_grow_with_the_ro
 def test_windows_do_not_depend_on_the_order_of_the_cameras():
     seen = road(200)
     shuffled = of_cameras(seen, np.random.default_rng(3).permutation(len(seen.centers)))
-    for (a, ra, ma), (b, rb, mb) in zip(find_balls(seen, 4.0), find_balls(shuffled, 4.0), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-9)
-        np.testing.assert_allclose([ra, ma], [rb, mb], rtol=1e-2)
+    for a, b in zip(find_balls(seen, 4.0), find_balls(shuffled, 4.0), strict=True):
+        np.testing.assert_allclose(a.center, b.center, atol=1e-9)
+        np.testing.assert_allclose([a.radius, a.margin], [b.radius, b.margin], rtol=1e-2)
 
 
 def test_some_cameras_observations_are_those_of_the_whole():

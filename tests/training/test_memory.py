@@ -16,7 +16,7 @@ from training_runs import datamanager, load, ready, trainer_config
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training import report
-from mmpi_ns.training.memory import Work, check_memory, describe, training_bytes
+from mmpi_ns.training.memory import check_memory, describe, texel_bytes, training_bytes
 from mmpi_ns.training.run import views_of
 from mmpi_ns.utils.errors import InputError
 
@@ -40,9 +40,9 @@ def test_memory_is_that_of_tables_and_moments(scene, plan_file, tmp_path, traini
     trainer = ready(trainer_config(scene, plan_file, tmp_path, 16, training=training))
     said = " ".join(capsys.readouterr().out.split())
     run = trainer._run
-    work = Work(run.field.feature_channels, two_phase=training == "two-phase")
+    per_texel = texel_bytes(run.field.feature_channels, two_phase=training == "two-phase")
     (window,) = run.progress.windows.windows
-    tables = training_bytes(window.plan, views_of(window, run.views), work, trainer.device)
+    tables = training_bytes(window.plan, views_of(window, run.views), per_texel, trainer.device)
     trainer.train()
     most = max(bytes_of(load(trainer.checkpoint_dir, step)) for step in range(1, 16))
     assert most == tables if training == "joint" else 0.5 * tables < most <= tables
@@ -79,7 +79,7 @@ def test_windows_and_memory_are_told():
 
 
 GPU = "cuda:1"
-WORK = Work(8, False)
+PER_TEXEL = texel_bytes(8, False)
 
 
 def large_plan(texels: float) -> ScenePlan:
@@ -99,13 +99,13 @@ def free(monkeypatch):
 
 def test_a_plan_for_which_too_little_memory_is_free_is_refused_with_the_texels_that_fit(free):
     free(64)
-    check_memory(WindowedPlan.single(large_plan(200e6)), lambda _: None, WORK, GPU)
+    check_memory(WindowedPlan.single(large_plan(200e6)), lambda _: None, PER_TEXEL, GPU)
     free(12)
     with pytest.raises(InputError, match="GiB are free") as error:
-        check_memory(WindowedPlan.single(large_plan(200e6)), lambda _: None, WORK, GPU)
+        check_memory(WindowedPlan.single(large_plan(200e6)), lambda _: None, PER_TEXEL, GPU)
     most = float(re.search(r"max-texels (\S+)\.$", str(error.value))[1])
     plan = large_plan(most)
-    assert 0.8 * 12 * 2**30 < training_bytes(plan, None, WORK) <= 12 * 2**30
+    assert 0.8 * 12 * 2**30 < training_bytes(plan, None, PER_TEXEL) <= 12 * 2**30
 
 
 def test_the_next_commands_can_be_copied_from_any_folder():

@@ -10,7 +10,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import TABLES
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
-from mmpi_ns.training.memory import Work, training_bytes
+from mmpi_ns.training.memory import texel_bytes, training_bytes
 from mmpi_ns.training.phases import Phase, Schedule
 from mmpi_ns.training.report import EARLY_COST, TrainingLog
 from mmpi_ns.training.storage import MOST_COPIED, copy_finely, refine
@@ -42,7 +42,7 @@ def used_bytes(field: MMPIField, optimizer: TouchedAdam) -> int:
 def test_texels_become_as_fine_as_rays_can_train_unless_hardly_anything_was_released(detail, share, factor):
     field = half_empty(detail, share)
     before = field.features.data.clone()
-    refine(field, Work(8, False), training_bytes(field.full_plan, None, Work(8, False)), [])
+    refine(field, texel_bytes(8, False), training_bytes(field.full_plan, None, texel_bytes(8, False)), [])
     assert field.factor == factor
     assert (factor > 1) != torch.equal(field.features.data, before)
 
@@ -52,12 +52,12 @@ def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(shar
     field = half_empty(64.0, share)
     optimizer = TouchedAdam([field.density, field.features], lr=0.1)
     trained = [(optimizer, field.density), (optimizer, field.features)]
-    budget = int(room * training_bytes(field.full_plan, None, Work(8, False)))
+    budget = int(room * training_bytes(field.full_plan, None, texel_bytes(8, False)))
     gain = torch.zeros(field.num_bricks + 1)
     count, best = field.num_bricks, field.num_bricks // 2
     gain[1:], gain[best] = 0.1, 5.0
     place = int(field.grids[0].places[best])
-    copy_finely(field, gain, Work(8, False), budget, trained)
+    copy_finely(field, gain, texel_bytes(8, False), budget, trained)
     if (share, room) in ((1.0, 1.0), (0.25, 0.3)):  # a brick and its neighbours have no room
         assert not field.copied and field.num_bricks == count
         return

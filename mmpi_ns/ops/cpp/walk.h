@@ -2,14 +2,9 @@
 // each terminates; then the values of the kept samples, ray by ray. Templated on the storage of texels: floats in the
 // bricks of training (march/render.cpp) or bytes in baked bricks (baked/baked.cpp).
 //
-// Parts of a walk, shared with training (march/march.cpp):
-//   ends.h       termination and depth of a ray; the page's shader reads it too
-//   crossings.h  intersected planes of all heads
-//   blend.h      blending by reliability
-//   here         stepping abreast, and sums
-// Training steps otherwise, one ray at a time and each head's samples in blocks: its rays are drawn at random, so sixteen
-// of them go different ways. Abreast, 4,096 of them take 2.2 times as long (40 instead of 18 ms, next to nothing kept), and
-// a frame's rays, which are neighbours, 0.7 times (48 instead of 69 ms).
+// Training (march/march.cpp) shares crossings.h and blend.h, and steps one ray at a time and each head's samples in blocks:
+// its rays are drawn at random, so sixteen of them go different ways. Abreast, 4,096 of them take 2.2 times as long (40
+// instead of 18 ms, next to nothing kept), and a frame's rays, which are neighbours, 0.7 times (48 instead of 69 ms).
 #pragma once
 #include "blend.h"
 #include "table.h"

@@ -7,12 +7,12 @@ a sample has the sigmoids of the former and the hyperbolic tangents of the latte
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -83,19 +83,13 @@ def gather_places(
 ) -> RaySums:
     """Sums over samples at places in the heads, without gradients; ``table`` holds all texels. In plain torch only:
     ``ops.march`` renders images."""
-    slots, raw = zip(*interpolated(layout, table, places), strict=True)
-    return _sums(torch.cat(raw), torch.cat(slots), weights)
-
-
-def interpolated(
-    layout: SceneLayout, table: Float[Tensor, "T C"], places: Places
-) -> Iterator[tuple[Int[Tensor, "N"], Float[Tensor, "N C"]]]:
-    """Flat slots of the samples of each head, and the interpolated values of the table there."""
+    slots, raw = [], []
     for k, grid in enumerate(layout.grids):
-        slots = (places.valid & (places.heads == k)).reshape(-1).nonzero()[:, 0]
-        ndc, planes = places.ndc.reshape(-1, 3)[slots], places.planes.reshape(-1)[slots]
-        rows, weights = grid.bilinear(planes, ndc) if k < len(layout.mpis) else grid.trilinear(ndc)
-        yield slots, interpolate_densely(table, rows, weights)
+        slots.append((places.valid & (places.heads == k)).reshape(-1).nonzero()[:, 0])
+        ndc, planes = places.ndc.reshape(-1, 3)[slots[k]], places.planes.reshape(-1)[slots[k]]
+        rows, shares = grid.bilinear(planes, ndc) if k < len(layout.mpis) else grid.trilinear(ndc)
+        raw.append(interpolate_densely(table, rows, shares))
+    return _sums(torch.cat(raw), torch.cat(slots), weights)
 
 
 def _sums(raw: Tensor, slots: Tensor, weights: Tensor) -> RaySums:
@@ -105,6 +99,15 @@ def _sums(raw: Tensor, slots: Tensor, weights: Tensor) -> RaySums:
     weight, colors = weight.detach(), value[:, :COLORS]
     sums = value.new_zeros(num_rays, 7).index_add(0, rays, torch.cat([weight, weight * colors, weight * colors**2], -1))
     return RaySums(gathered, sums[:, :1].detach(), sums[:, 1:4], sums[:, 4:])
+
+
+def number_samples(
+    slots: Int[Tensor, "N"], chosen: Bool[Tensor, "R"], weights: Float[Tensor, "R S"]
+) -> Int32[Tensor, "R S"]:
+    """Number of the sample in each slot of the chosen rays; -1 where there is none."""
+    numbers = torch.full(weights.shape, -1, dtype=torch.int32, device=weights.device)
+    numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32, device=weights.device)
+    return numbers.masked_fill_(~chosen[:, None], -1)
 
 
 LANES = 16
@@ -129,8 +132,7 @@ class _GatherTaps(torch.autograd.Function):
         (num_rays, width), channels = weights.shape, values.shape[1]
         saved = [x.contiguous() for x in (values, weights, slots, chosen, *taps)]
         values, weights, slots, chosen = saved[:4]
-        numbers = torch.full((num_rays, width), -1, dtype=torch.int32)
-        call_in_parts("mmpi_number_samples", len(slots), slots, chosen, width, numbers, least=AT_LEAST)
+        numbers = number_samples(slots, chosen, weights)
         sums = torch.empty(num_rays, channels + 1 + COLORS)
         samples = (_groups(saved[4:]), numbers, weights, width)
         call_in_parts("mmpi_gather_taps", num_rays, values, *values.shape, *samples, sums)

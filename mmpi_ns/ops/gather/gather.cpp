@@ -77,13 +77,6 @@ void mmpi_gather_taps(int64_t begin, int64_t end, const float* values, int64_t r
     }
 }
 
-// numbers[slots[n]] = n for samples [begin, end) of rays that are chosen.
-void mmpi_number_samples(int64_t begin, int64_t end, const int64_t* slots, const bool* chosen, int64_t slots_per_ray,
-                         int32_t* numbers) {
-    for (int64_t n = begin; n < end; n++)
-        if (chosen[slots[n] / slots_per_ray]) numbers[slots[n]] = int32_t(n);
-}
-
 // Gradients of values [rows, channels] (null if not needed), of the taps' weights (in the taps, added to what is there)
 // and of weights [R, S] from those of the sums [R, padded] and, except for the weights, of the sums of
 // colours and twice those of squared colours [R, 16], padded with zeros. Samples of rays that are not `chosen` have none.
@@ -142,5 +135,4 @@ void mmpi_gather_back(int64_t begin, int64_t end, const float* values, int64_t r
 } // namespace
 
 IN_PARTS(mmpi_gather_taps)
-IN_PARTS(mmpi_number_samples)
 IN_PARTS(mmpi_gather_back)

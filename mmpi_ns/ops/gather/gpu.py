@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gather import COLORS, RaySums, Taps
+from mmpi_ns.ops.gather import COLORS, RaySums, Taps, number_samples
 from mmpi_ns.ops.gpu_scene import block_size, launch
 
 NUMBERS = 512
@@ -120,9 +120,7 @@ class _GatherTaps(torch.autograd.Function):
         saved = [x.contiguous() for x in (values, weights, slots, chosen, *taps)]
         values, weights, slots, chosen, positions, shares, cube_positions, cube_shares = saved
         (num_rays, width), channels, device = weights.shape, values.shape[1], values.device
-        numbers = torch.full((num_rays, width), -1, dtype=torch.int32, device=device)
-        numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32, device=device)
-        numbers.masked_fill_(~chosen[:, None], -1)
+        numbers = number_samples(slots, chosen, weights)
         sums = torch.zeros(num_rays, channels + 1 + COLORS, device=device)
         columns, block, warps = sizes(channels, device)
         tensors = (values, numbers, weights, positions, shares, cube_positions, cube_shares, sums)
