@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.placement.observations import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_turn, num_threads, one_thread_each
 from mmpi_priors.ops.matches import Measured, average_matches, compare_depths, follow_motion, solve_matches

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.placement.observations import nearest_views
 from mmpi_priors.views import Map, project
 
 WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.placement.observations import nearest_views
 from mmpi_ns.utils.files import opened
 from mmpi_ns.utils.parallel import in_order, num_threads, one_thread_each
 from mmpi_priors.cache import Arrays, Computed, kept

@@ -21,7 +21,7 @@ from mmpi_ns.data.dataset import MMPIDataset, image_and_mask
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.data.priors import DepthPriors, SharedPoints
 from mmpi_ns.data.rays import Rays
-from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.placement.observations import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order
 from mmpi_priors.cache import held

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from mmpi_ns.data.checks import log_once
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.posed_images import PosedImages, at_full_size, camera_observations, posed_images
-from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.placement.observations import Array, Observations, nearest_views
 from mmpi_ns.utils.errors import InputError, quoted
 from mmpi_priors.cache import Arrays, kept
 from mmpi_priors.clouds import point_cloud, usable_points

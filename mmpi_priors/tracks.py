@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.data.posed_images import PosedImages
-from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.placement.observations import nearest_views
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import opened
 from mmpi_priors import sfm

@@ -118,14 +118,11 @@ class Gains:
         return self.factors / np.clip(self.factors.min(), MOST_HEADROOM, 1)
 
     @property
-    def confirmed(self) -> bool:
-        """Whether held-out pairs agree better with the gains than without."""
-        return self.corrected < AGREEMENT * self.disagreement
-
-    @property
     def matter(self) -> bool:
-        """Whether images differ by more than the errors of the gains, and the gains are confirmed."""
-        return bool(self.confirmed and np.log(self.span) > max(SPAN, SPAN_ERRORS * float(np.median(self.errors))))
+        """Whether images differ by more than the errors of the gains, and held-out pairs agree better with the gains
+        than without."""
+        confirmed = self.corrected < AGREEMENT * self.disagreement
+        return bool(confirmed and np.log(self.span) > max(SPAN, SPAN_ERRORS * float(np.median(self.errors))))
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,6 @@ def launch(kernel: Any, size: int, block: int, *arguments: Any, **constants: Any
             kernel[(triton.cdiv(size, block),)](*arguments, **constants)
 
 
-# Texels -------------------------------------------------------------------------------------------------------------
-
-
 @triton.jit
 def row_of(grids, head, plane, y, x, mask):
     """Row of a head's texel in the pooled tables. Only this and ``texel_of`` depend on how texels are stored.

@@ -3,6 +3,7 @@ robust to outliers and independent of any order. Plain float64 NumPy."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -31,6 +32,8 @@ SPAN = (0.25, 0.9)
 """Quantiles that bound the depths of an image's points."""
 COVERED, LEAST_COVERED = 3000, 0.25
 """Number of points for which images are counted, and share of them that may be seen by fewer pixels than the result."""
+APART = 1e-9
+"""Cameras closer together than this fraction of the largest distance (at least 1) stand in one place: no parallax."""
 FACTOR, SUPPORT = 1.5, 0.04
 """Content starts, for a camera, at the least depth such that depths up to FACTOR times it contain the share SUPPORT of
 its observations."""
@@ -248,6 +251,31 @@ def farthest_first(places: Array, count: int | None = None, radius: float = 0.0)
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(places - places[chosen[-1]], axis=-1))
     return chosen
+
+
+def nearest_views(
+    camera_to_worlds: NDArray[np.float64],
+    i: int,
+    count: int,
+    max_angle: float = 180.0,
+    among: Sequence[int] | NDArray[np.int64] | None = None,
+    apart: bool = True,
+) -> list[int]:
+    """Cameras nearest to camera ``i`` with a similar viewing direction, nearest first.
+
+    Args:
+        camera_to_worlds: poses, axes in columns, z backwards or forwards. [M, 3, 4]
+        max_angle: between viewing directions, degrees.
+        among: the cameras to choose from; None for all.
+        apart: only cameras in another place, whose images have a parallax.
+    """
+    others = np.arange(len(camera_to_worlds)) if among is None else np.asarray(among, np.int64)
+    distance = np.linalg.norm(camera_to_worlds[others, :, 3] - camera_to_worlds[i, :, 3], axis=-1)
+    usable = distance > APART * max(1.0, float(distance.max(initial=0.0))) if apart else others != i
+    if max_angle < 180:
+        usable &= camera_to_worlds[others, :, 2] @ camera_to_worlds[i, :, 2] > np.cos(np.radians(max_angle))
+    order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
+    return others[order[: min(count, int(usable.sum()))]].tolist()
 
 
 def _start(depth: Array) -> float:

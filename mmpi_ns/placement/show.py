@@ -10,11 +10,26 @@ from matplotlib.figure import Figure
 
 from mmpi_ns.placement.errors import WORST, pixel_errors
 from mmpi_ns.placement.observations import Array, Observations, find_visible_points
+from mmpi_ns.placement.split import cameras_of, of_cameras
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import WindowedPlan
 
 DRAWN_POINTS = 6000
 DRAWN_PLANES = 12
+
+
+def explain(windows: WindowedPlan, observations: Observations) -> str:
+    """The tables of a plan: for each window, over the observations of its own cameras."""
+    parts = []
+    for i, window in enumerate(windows.windows):
+        part = of_cameras(observations, cameras_of(window, observations.centers))
+        title = f"## Window {i}: {len(part.centers)} training cameras\n\n" if len(windows) > 1 else ""
+        rule = window.plan.origin_of_plan
+        parts.append(f"{title}{table(window.plan, part)}\n\n{rule[0].upper()}{rule[1:]}.")
+    if len(windows) > 1:
+        total = sum(plan.texels for plan in windows.plans) / 1e6
+        parts.append(f"{len(windows)} windows, {total:.2f} M texels in all.")
+    return "\n\n".join(parts)
 
 
 def table(plan: ScenePlan, observations: Observations) -> str:

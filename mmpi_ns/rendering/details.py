@@ -33,7 +33,7 @@ from torch.nn.functional import grid_sample
 from mmpi_ns.data.rays import image_rays
 from mmpi_ns.ops.build import HEADERS
 from mmpi_ns.ops.ends import numbers_in
-from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.placement.observations import nearest_views
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import write_arrays, write_atomically
 

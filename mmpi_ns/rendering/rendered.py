@@ -35,11 +35,7 @@ def background_of(name: str, like: Tensor) -> Tensor:
 
 
 class Exposures(torch.nn.Module):
-    """Colours of each training image over those of the field; empty where all have the same exposure.
-
-    Args:
-        gains: of the training images, if they differ.
-    """
+    """Colours of each training image over those of the field; empty where all have the same exposure (no ``gains``)."""
 
     factors: Float[Tensor, "N 3"]
     falloff: Float[Tensor, "2 3"]

@@ -19,7 +19,6 @@ from mmpi_ns.utils.values import Number, check_options
 if TYPE_CHECKING:
     from mmpi_ns.data.datamanager import MMPIDataManager
     from mmpi_ns.placement.observations import Observations
-    from mmpi_ns.scene.windows import WindowedPlan
 
 
 @dataclass
@@ -44,6 +43,7 @@ class PlanCommand:
 
     def main(self) -> None:
         # Slow imports, which --help does not need.
+        from mmpi_ns.placement.show import draw_plan, explain
         from mmpi_ns.placement.split import most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import make_writable, write_plan, write_text
@@ -60,7 +60,8 @@ class PlanCommand:
             steps = steps_for(most_pixels(observations, self.placement), self.size)
             sized = replace(self.placement, max_texels=self.size * self.placement.max_texels)
             windows = place_windows(observations, sized, steps * RAYS)
-        text = self._explain(windows, observations)
+        draw_plan(self.output / "plan.png", windows, observations)
+        text = explain(windows, observations)
         if manager.priors is not None and manager.priors.movers:
             text += f"\n\n{manager.priors.movers}."
         plan = self.output / "plan.json"
@@ -69,23 +70,6 @@ class PlanCommand:
         print(text)
         print(f"\nWrote plan.json, plan.md and plan.png in {self.output}.")
         print(f"Train with it: ns-train mmpi --pipeline.model.plan-file {quoted(plan)} --data ...")
-
-    def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
-        """Draws the plan and returns the tables: for each window, over the observations of its own cameras."""
-        from mmpi_ns.placement.show import draw_plan, table
-        from mmpi_ns.placement.split import cameras_of, of_cameras
-
-        draw_plan(self.output / "plan.png", windows, observations)
-        parts = []
-        for i, window in enumerate(windows.windows):
-            part = of_cameras(observations, cameras_of(window, observations.centers))
-            title = f"## Window {i}: {len(part.centers)} training cameras\n\n" if len(windows) > 1 else ""
-            rule = window.plan.origin_of_plan
-            parts.append(f"{title}{table(window.plan, part)}\n\n{rule[0].upper()}{rule[1:]}.")
-        if len(windows) > 1:
-            total = sum(plan.texels for plan in windows.plans) / 1e6
-            parts.append(f"{len(windows)} windows, {total:.2f} M texels in all.")
-        return "\n\n".join(parts)
 
 
 def load_observations(data: Path, downscale_factor: int | None) -> tuple[Observations, MMPIDataManager]:

@@ -5,8 +5,8 @@ and by the cube (``assign_heads``). Training rays mark the texels that they read
 texel is marked.
 
 ``blend``: before its first step, texels that no ray has trained are emptied, so that they have no share
-(``release_untrained``). Then all heads render each ray, blended by reliability (``mmpi_ns/blending.py``), and only
-reliability trains. Texels are no longer marked, so that P is continuous in time.
+(``TexelTables.release_untouched``). Then all heads render each ray, blended by reliability (``mmpi_ns/blending.py``),
+and only reliability trains. Texels are no longer marked, so that P is continuous in time.
 
 ``finetune``: all parameters train together, rendered likewise (not in the paper).
 
@@ -20,13 +20,12 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 from torch.nn import Parameter
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.tables import TexelTables
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.random_draws import Generators
 
@@ -52,12 +51,6 @@ def prepare_parameters(field: MMPIField, groups: Mapping[str, Sequence[Parameter
     field.marks_texels = phase == "individual"
     for kind, params in groups.items():
         params[0].requires_grad_(kind in TRAINS[phase])
-
-
-def release_untrained(field: TexelTables, phase: str, is_first_step: bool) -> list[Int[Tensor, "K"] | None]:
-    """Empties untrained texels before the first step of blending; returns the remaining bricks as
-    ``release_unused``."""
-    return [field.release_untouched()] if phase == "blend" and is_first_step else []
 
 
 def assign_heads(

@@ -17,7 +17,6 @@ from mmpi_ns.scene.plan import FINER, MOST_TEXELS
 from mmpi_ns.scene.texels import head_shapes
 from mmpi_ns.training.memory import stored_bytes, texel_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
-from mmpi_ns.training.reliability import release_untrained
 from mmpi_ns.utils.errors import log
 from mmpi_ns.utils.host import give_back_freed_memory
 
@@ -53,7 +52,8 @@ def prepare_storage(
         give_back_freed_memory()
     elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
         field.look_afresh()
-    remaining += release_untrained(field, phase.name, step == phase.start)
+    if phase.name == "blend" and step == phase.start:
+        remaining.append(field.release_untouched())
     for kept in remaining:
         gain = gain if gain is None or kept is None else gain[kept]
         for optimizer, table in trained if kept is not None else ():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.placement.observations import nearest_views
 
 
 def poses_of(places, angles):
