@@ -14,8 +14,6 @@ from mmpi_ns.settings import ScheduleConfig
 from mmpi_ns.training.reliability import TRAINS, phase_lengths
 from mmpi_ns.utils.errors import InputError
 
-SOONER = 4
-"""Factor by which texels double earlier with depth priors, as surfaces need not form."""
 GROWING_SHARE, FULL_STEPS = 0.5, 1250
 """Share of the batch drawn while texels grow from initial surfaces, when rays cost most and coarse texels need few.
 Runs of at most so many steps draw all; longer ones draw at least as many rays in total (docs/ablations.md)."""
@@ -143,14 +141,11 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, ha
     ends = accumulate(lengths.values())
     phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)
     first = phases[0].end
-    doublings = {s: s / SOONER if has_depths else s for s in config.growth_shares}
-    growth = tuple(max(1, round(s * first)) for s in doublings.values())
+    growth = tuple(max(1, round(s * first)) for s in config.growth_shares)
     rates = float(config.decay_decades), float(config.decay_from)
     share = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if has_depths else 1.0
     schedule = Schedule(phases, growth, *rates, windows, growing_share=share)
-    release = (
-        sorted({round(doublings.get(s, s) * first) for s in config.release_shares}) if config.release_weight > 0 else []
-    )
+    release = sorted({round(s * first) for s in config.release_shares}) if config.release_weight > 0 else []
     # A release at a growth step comes before it, so that less grows.
     return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from or s in growth))
 
