@@ -103,7 +103,7 @@ def trainer_config(data: Path, plan: Path, output: Path, steps=24, **model):
         "rays_per_mpi": "split",
         "blend_share": 0.25,
         "finetune_share": 0.25,
-        "growth_shares": (1 / 2, 1.0),  # four times as early, as depths are known
+        "growth_shares": (1 / 8, 1 / 4),
         "release_weight": 0.0,
     }
     settings |= {"hidden_width": 8, "feature_channels": 4, "cube_alpha": 0.03}
