@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
-TEST, TRAIN = "Eval Metrics Dict/psnr", "Train Loss Dict/rgb_loss"
+TEST, TRAIN = "Eval Images Metrics Dict (all images)/psnr", "Train Loss Dict/rgb_loss"
 """nerfstudio's names of the quantities drawn."""
 
 
@@ -48,7 +48,7 @@ def draw_curve(run: Path, target: Path, started: float, title: str) -> float:
     """
     test, train = read_curve(run, TEST), read_curve(run, TRAIN)
     if not len(test):
-        raise ValueError(f"{run} holds no logged evaluation: train with --vis tensorboard and --steps-per-eval-batch.")
+        raise ValueError(f"{run} holds no scores: train with --vis tensorboard and --steps-per-eval-all-images.")
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(xlabel="seconds since ns-train was started", ylabel="PSNR, dB", title=title)
@@ -56,7 +56,7 @@ def draw_curve(run: Path, target: Path, started: float, title: str) -> float:
         axes.plot(
             train[:, 0] - started, psnr_of_squared_error(train[:, 2]), ".", color="0.75", label="training batches"
         )
-    axes.plot(test[:, 0] - started, test[:, 2], "o-", color="#d62728", label="random pixels of the test images")
+    axes.plot(test[:, 0] - started, test[:, 2], "o-", color="#d62728", label="test images")
     last = (test[-1, 0] - started, test[-1, 2])
     axes.annotate(f"{last[1]:.1f} dB", last, xytext=(0, -18), textcoords="offset points", ha="right")
     axes.set_xlim(left=0)

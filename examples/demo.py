@@ -130,11 +130,12 @@ class Demo:
             (self.folder / "times.json").write_text(json.dumps(begun), encoding="utf-8")
         else:
             print(f"Continuing from step {newest}.")
-        every = str(max(1, self.steps // 12))
+        every = str(max(1, self.steps // 6))
         self._command(
             "ns-train", "mmpi", "--data", str(self.scene), "--output-dir", str(self.folder / "runs"),
             "--experiment-name", self.kind, "--timestamp", "demo", "--max-num-iterations", str(self.steps),
-            "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
+            "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)),
+            "--steps-per-eval-all-images", every,
             "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
             "--pipeline.model.lpips-net", "none",  # would download half a gigabyte of weights
             "--pipeline.datamanager.priors.depth-images", "False",  # exact depths, which captures have not
