@@ -89,7 +89,8 @@ class ScheduleConfig:
     decay_from: float = 0.5
     """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
-    """Times at which the texels of a plane double, as shares of the first phase."""
+    """Times at which the texels of a plane double, as shares of the first phase; with depth priors, of at most 4,000
+    steps of it."""
     release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
     """Times at which empty bricks (8 x 8 texels of a plane) are released, as shares of the first phase: after growth,
     or just before the texels double."""

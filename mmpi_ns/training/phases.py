@@ -17,6 +17,8 @@ from mmpi_ns.utils.errors import InputError
 GROWING_SHARE, FULL_STEPS = 0.5, 1250
 """Share of the batch drawn while texels grow from initial surfaces, when rays cost most and coarse texels need few.
 Runs of at most so many steps draw all; longer ones draw at least as many rays in total (docs/ablations.md)."""
+MOST_GROWING = 4000
+"""Steps that ``growth_shares`` are of in a longer first phase with depth priors: surfaces need no more to form."""
 COPIES_FROM = 0.75
 """Share of the period of high learning rates after which MPIs may get finer copies."""
 
@@ -141,11 +143,13 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, ha
     ends = accumulate(lengths.values())
     phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)
     first = phases[0].end
-    growth = tuple(max(1, round(s * first)) for s in config.growth_shares)
+    growing = min(first, MOST_GROWING) if has_depths else first
+    growth = tuple(max(1, round(s * growing)) for s in config.growth_shares)
     rates = float(config.decay_decades), float(config.decay_from)
     share = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if has_depths else 1.0
     schedule = Schedule(phases, growth, *rates, windows, growing_share=share)
-    release = sorted({round(s * first) for s in config.release_shares}) if config.release_weight > 0 else []
+    release = [round(s * (growing if s in config.growth_shares else first)) for s in config.release_shares]
+    release = sorted(set(release)) if config.release_weight > 0 else []
     # A release at a growth step comes before it, so that less grows.
     return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from or s in growth))
 

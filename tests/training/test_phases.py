@@ -6,7 +6,8 @@ import pytest
 from training_runs import schedule_of
 
 from mmpi_ns.config import mmpi, mmpi_kitti, mmpi_scannet, mmpi_scannet_short
-from mmpi_ns.training.phases import TRAINS, Phase, Schedule
+from mmpi_ns.settings import ScheduleConfig
+from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule
 
 KINDS = ("density", "features", "colour", "reliability", "camera_opt")
 
@@ -107,3 +108,14 @@ def test_the_papers_methods_keep_its_settings(method):
 )
 def test_a_phase_ends_just_before_the_next_begins(step, name):
     assert two_phase().phase_at(step).name == name
+
+
+def test_a_long_run_from_surfaces_grows_no_longer_than_a_short_one():
+    config = ScheduleConfig()
+    short, long, fog = (
+        make_schedule(config, n, has_depths=d) for n, d in ((4000, True), (16000, True), (16000, False))
+    )
+    assert short.growth == long.growth == (267, 533, 800, 1067)
+    assert fog.growth == (1067, 2133, 3200, 4267)
+    assert set(long.growth[2:]) <= set(long.release), "bricks are released before they double"
+    assert [s for s in long.release if s > 1067] == [2400, 4800, 8000, 12000, 15200]
