@@ -89,8 +89,8 @@ class ScheduleConfig:
     decay_from: float = 0.5
     """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
-    """Times at which the texels of a plane double, as shares of the first phase; with depth priors, of at most 4,000
-    steps of it."""
+    """Times at which the texels of a plane double, as shares of the first phase. Surfaces have formed at the last one;
+    with depth priors, at the second, and shares are of at most 4,000 steps."""
     release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
     """Times at which empty bricks (8 x 8 texels of a plane) are released, as shares of the first phase: after growth,
     or just before the texels double."""
@@ -103,7 +103,7 @@ class SamplingConfig:
     """Samples of a ray: ``--pipeline.model.sampling.*``."""
 
     threshold: float = 3e-3
-    """Weight below which samples get no gradient (at most a tenth of an equal share while the resolution grows)."""
+    """Weight below which samples get no gradient (at most a tenth of an equal share until surfaces have formed)."""
     cube_alpha: float = 1e-3
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
 

@@ -49,6 +49,8 @@ class Schedule:
     growth."""
     growing_share: float = 1.0
     """Share of the batch that a step draws until surfaces have formed (``sharpened``)."""
+    formed: int = 0
+    """Step from which surfaces count as formed."""
 
     @property
     def is_joint(self) -> bool:
@@ -81,11 +83,12 @@ class Schedule:
         return 2.0 ** -sum(self._local(step) < g for g in self.growth)
 
     def sharpened(self, step: int) -> bool:
-        """Whether surfaces have formed: resolution has stopped growing (without growth: a tenth of the first phase)."""
-        return self._local(step) >= self._sharp_from
+        """Whether surfaces have formed, so that all samples of little weight are dropped."""
+        return self._local(step) >= self.formed
 
     @property
-    def _sharp_from(self) -> int:
+    def _grown(self) -> int:
+        """Step from which resolution has stopped growing (without growth: a tenth of the first phase)."""
         return self.growth[-1] if self.growth else self.phases[0].end // 10
 
     def releases_at(self, step: int) -> bool:
@@ -96,7 +99,7 @@ class Schedule:
         """Whether texels may become finer than planned before this step: at releases after the last growth, as long as
         rates are high. ``copies``: whether MPIs may get finer copies, which wait until all texels had time to."""
         high = self.decay_from * self.phases[0].end
-        is_high = max(self._sharp_from, COPIES_FROM * high if copies else 0) < self._local(step) <= high
+        is_high = max(self._grown, COPIES_FROM * high if copies else 0) < self._local(step) <= high
         return is_high and self.releases_at(step)
 
     def watches(self, step: int) -> bool:
@@ -104,7 +107,7 @@ class Schedule:
         if not self.release:
             return False
         # From when on the texels have the size that they have before the first release.
-        first = max([s for s in self.growth if s < self.release[0]], default=0) if self.growth else self._sharp_from
+        first = max([s for s in self.growth if s < self.release[0]], default=0) if self.growth else self._grown
         return first <= self._local(step) < self.release[-1]
 
     def rate_factor(self, kind: str, step: int) -> float:
@@ -151,7 +154,11 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, ha
     release = [round(s * (growing if s in config.growth_shares else first)) for s in config.release_shares]
     release = sorted(set(release)) if config.release_weight > 0 else []
     # A release at a growth step comes before it, so that less grows.
-    return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from or s in growth))
+    return replace(
+        schedule,
+        release=tuple(s for s in release if s > schedule._grown or s in growth),
+        formed=growth[(len(growth) - 1) // 2] if has_depths and growth else schedule._grown,
+    )
 
 
 def check_schedule(config: ScheduleConfig) -> None:

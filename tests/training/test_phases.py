@@ -117,5 +117,7 @@ def test_a_long_run_from_surfaces_grows_no_longer_than_a_short_one():
     )
     assert short.growth == long.growth == (267, 533, 800, 1067)
     assert fog.growth == (1067, 2133, 3200, 4267)
+    assert short.formed == long.formed == 533 and fog.formed == 4267
+    assert not long.sharpened(532) and long.sharpened(533)
     assert set(long.growth[2:]) <= set(long.release), "bricks are released before they double"
     assert [s for s in long.release if s > 1067] == [2400, 4800, 8000, 12000, 15200]

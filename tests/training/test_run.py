@@ -70,8 +70,10 @@ def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(shar
 
 
 def test_the_time_left_knows_that_steps_cost_less_once_surfaces_have_formed():
-    schedule = Schedule((Phase("joint", 0, 100),), (10, 20), 1.0, 0.0, windows=2)
+    schedule = Schedule((Phase("joint", 0, 100),), (10, 20), 1.0, 0.0, windows=2, formed=20)
     log = TrainingLog(schedule, rays=64, first=0)
-    assert log.remaining(149) == 50 and log.remaining(199) == 0
-    assert log.remaining(110) == pytest.approx(9 + 80 / EARLY_COST)
-    assert log.remaining(20) == pytest.approx(79 + 20 * EARLY_COST + 80)
+    assert log.remaining(149, 149) == 50 and log.remaining(190, 199) == 0
+    assert log.remaining(110, 110) == pytest.approx(9 + 80 / EARLY_COST)
+    assert log.remaining(20, 20) == pytest.approx(79 + 20 * EARLY_COST + 80)
+    mixed = (1 + EARLY_COST) / 2
+    assert log.remaining(119, 120) == pytest.approx(79 / mixed), "an interval on both sides of the border"
