@@ -99,7 +99,7 @@ def _find_points(
     ``check`` returns whether the cameras contradict the matches, after printing it."""
     images = posed_images(observations, dataset)
     if images is None:
-        CONSOLE.print("Cameras that are neither perspective nor fisheye: no features are matched.")
+        CONSOLE.print("Cameras that are neither fisheye nor perspective without a k4: no features are matched.")
     elif triangulates:
         originals = at_full_size(images)
 

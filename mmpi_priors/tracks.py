@@ -74,8 +74,8 @@ def triangulate(images: PosedImages) -> SfmModel:
     pycolmap, tracks, error, matches = load_pycolmap(), None, np.nan, None
     cameras = []
     for i, (width, height) in enumerate(images.sizes.astype(int).tolist()):
-        lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
-        params = [*images.intrinsics[i], *images.distortion[i]]
+        lens, params = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV", [*images.intrinsics[i], *images.lens(i)]
+        lens, params = ("FULL_OPENCV", [*params, 0.0, 0.0, 0.0]) if any(params[8:]) else (lens, params[:8])
         camera = pycolmap.Camera(model=lens, width=width, height=height, params=params, camera_id=i + 1)
         camera.has_prior_focal_length = True
         cameras.append(camera)

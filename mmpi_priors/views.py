@@ -68,7 +68,7 @@ def load_view(images: PosedImages, i: int, side: int) -> View:
     inside = np.broadcast_to(True, gray.shape)  # of no size
     if images.is_bent(i):
         size = gray.shape[1], gray.shape[0]
-        x, y = _bent_places(images.is_fisheye(i), tuple(images.distortion[i]), tuple(pinhole), size)
+        x, y = _bent_places(images.is_fisheye(i), tuple(images.lens(i)), tuple(pinhole), size)
         gray = cv2.remap(gray, x, y, cv2.INTER_LINEAR)
         inside = (x >= 0) & (x <= size[0] - 1) & (y >= 0) & (y <= size[1] - 1)
     return View(np.ascontiguousarray(gray, np.uint8), pinhole, images.camera_to_worlds[i], inside)
@@ -98,7 +98,7 @@ def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.ui
     size = view.gray.shape[1], view.gray.shape[0]
     color = cv2.resize(_read(images.files[i], cv2.IMREAD_COLOR), size, interpolation=cv2.INTER_AREA)
     if images.is_bent(i):
-        places = _bent_places(images.is_fisheye(i), tuple(images.distortion[i]), tuple(view.pinhole), size)
+        places = _bent_places(images.is_fisheye(i), tuple(images.lens(i)), tuple(view.pinhole), size)
         color = cv2.remap(color, *places, cv2.INTER_LINEAR)
     return np.asarray(color, np.uint8)
 
@@ -106,7 +106,7 @@ def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.ui
 def straightened(images: PosedImages, i: int, shape: tuple[int, int], some: slice | None = None) -> NDArray[np.float64]:
     """Tangents (right, down) of the rays of an image's pixels at this shape, without lens distortion; of some rows. [2,
     H, W]"""
-    lens = tuple(images.distortion[i]) if images.is_bent(i) else ()
+    lens = tuple(images.lens(i)) if images.is_bent(i) else ()
     camera = tuple(images.sizes[i]), tuple(images.intrinsics[i]), lens, images.is_fisheye(i)
     rows = [some] if some else strips(shape)
     parts = [_straightened_rows(*camera, shape, part.start, part.stop) for part in rows]
@@ -170,13 +170,13 @@ class Parallax:
 def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pixels [P, 2] of points [P, 3] in a camera, lens included; far outside for points behind it or so far to the side
     that the lens's polynomial turns back."""
-    pose, fisheye, lens = posed.camera_to_worlds[j], posed.is_fisheye(j), posed.distortion[j]
+    pose, fisheye, lens = posed.camera_to_worlds[j], posed.is_fisheye(j), posed.lens(j)
     x, y, depth = ((points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]).T  # OpenCV's axes: right, down, ahead
     ahead, aside = depth > 0, np.hypot(x, y)
     depth = np.where(ahead, depth, 1)
     radius = np.arctan2(aside, depth) if fisheye else aside / depth
     # Powers of the squared radius; the radius from which the lens turns back is where their sum's slope has its root.
-    powers = np.array([1.0, *lens[: 4 if fisheye else 2]])
+    powers = np.array([1.0, *(lens if fisheye else (*lens[:2], *lens[4:]))])
     slope = powers * (2 * np.arange(len(powers)) + 1)
     roots = np.polynomial.polynomial.polyroots(np.trim_zeros(slope, "b"))
     squares = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]

@@ -30,7 +30,7 @@ class PosedImages:
     sizes: NDArray[np.float64]
     """[M, 2]: width, height in pixels."""
     distortion: NDArray[np.float64]
-    """[M, 4]: k1, k2, p1, p2 (OpenCV), or k1 to k4 of a fisheye lens."""
+    """[M, 4 or 5]: k1, k2, p1, p2 and k3 if there is one (OpenCV), or k1 to k4 of a fisheye lens."""
     fisheye: NDArray[np.bool_] | bool = False
     """Whether the lens of each image is a fisheye: [M], or one for all."""
 
@@ -42,16 +42,21 @@ class PosedImages:
         """Whether the lens of image i is not a pinhole; a fisheye never is, even if all its terms are 0."""
         return self.is_fisheye(i) or bool(self.distortion[i].any())
 
+    def lens(self, i: int) -> NDArray[np.float64]:
+        """OpenCV's terms of image i."""
+        return self.distortion[i][: 4 if self.is_fisheye(i) else 5]
+
 
 def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImages | None:
-    """The training images with their cameras and lenses; None where a camera is neither perspective nor fisheye."""
+    """The training images with their cameras and lenses; None where a camera is neither fisheye nor perspective, or
+    perspective with a k4, which OpenCV lacks."""
     kinds = dataset.cameras.camera_type.reshape(-1).cpu()
     is_fisheye = kinds == CameraType.FISHEYE.value
-    if not (is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all():
-        return None
     lens = dataset.cameras.distortion_params  # k1, k2, k3, k4, p1, p2
-    lens = torch.zeros(len(dataset), 6) if lens is None else lens.reshape(len(dataset), 6).cpu()
-    lens = torch.where(is_fisheye[:, None], lens[:, :4], lens[:, [0, 1, 4, 5]])
+    lens = torch.zeros(len(dataset), 6) if lens is None else lens.reshape(len(dataset), -1).cpu()
+    if not (is_fisheye | (kinds == CameraType.PERSPECTIVE.value) & (lens[:, 3] == 0)).all():
+        return None
+    lens = torch.where(is_fisheye[:, None], lens[:, :5], lens[:, [0, 1, 4, 5, 2]])
     files = tuple(map(Path, dataset.image_filenames))
     cameras = observations.camera_to_worlds, observations.intrinsics, observations.sizes
     return PosedImages(files, *cameras, distortion=lens.double().numpy(), fisheye=is_fisheye.numpy())

@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 from tiny_scene import write_colmap
 
-from mmpi_ns.data.posed_images import PosedImages, posed_images
+from mmpi_ns.data.posed_images import PosedImages, camera_observations, posed_images
 from mmpi_ns.placement.observations import Observations
 from mmpi_priors.observe import (
     drop_masked,
@@ -21,6 +21,7 @@ from mmpi_priors.observe import (
     with_tracks,
 )
 from mmpi_priors.sfm import SfmModel, find_sfm_model, numbers_in_model
+from mmpi_priors.views import project, straightened
 
 SIZES = np.array([[40.0, 20.0], [80.0, 60.0]])
 
@@ -53,6 +54,7 @@ def as_data(kind=CameraType.PERSPECTIVE, lens=None, **more):
 
 
 LENS = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [1.1, 1.2, 1.3, 1.4, 1.5, 1.6]])  # nerfstudio's k1 k2 k3 k4 p1 p2
+PERSPECTIVE = LENS * torch.tensor([1, 1, 1, 0, 1, 1])  # OpenCV has no k4
 
 
 def test_images_of_a_rig_are_told_apart_by_their_folders():
@@ -66,20 +68,36 @@ def test_images_of_a_rig_are_told_apart_by_their_folders():
 
 def test_each_camera_of_a_mixture_has_its_own_lens_and_others_are_none():
     kinds = torch.tensor([[CameraType.PERSPECTIVE.value], [CameraType.FISHEYE.value]])
-    images = posed_images(bare(), as_data(kind=kinds, lens=LENS))
+    lens = torch.stack([PERSPECTIVE[0], LENS[1]])
+    images = posed_images(bare(), as_data(kind=kinds, lens=lens))
     assert images is not None and [images.is_fisheye(i) for i in range(2)] == [False, True]
-    assert images.distortion == pytest.approx(np.array([(0.1, 0.2, 0.5, 0.6), (1.1, 1.2, 1.3, 1.4)]))
-    kinds[1] = CameraType.EQUIRECTANGULAR.value
+    assert [images.lens(i).round(6).tolist() for i in range(2)] == [[0.1, 0.2, 0.5, 0.6, 0.3], [1.1, 1.2, 1.3, 1.4]]
     assert posed_images(bare(), as_data(kind=kinds, lens=LENS)) is None
+    kinds[1] = CameraType.EQUIRECTANGULAR.value
+    assert posed_images(bare(), as_data(kind=kinds, lens=lens)) is None
+
+
+def test_k3_of_a_perspective_lens_bends_views_as_it_bends_rays():
+    """The oracle is nerfstudio's ray generator."""
+    data = as_data(lens=torch.tensor([[0.05, -0.02, 0.3, 0.0, 0.01, -0.01]]).repeat(2, 1))
+    images = posed_images(camera_observations(data.cameras, []), data)
+    assert images is not None
+    local = data.cameras.generate_rays(0).directions.double().numpy()
+    wanted = np.stack([local[..., 0], -local[..., 1]]) / -local[..., 2]
+    np.testing.assert_allclose(straightened(images, 0, (20, 40)), wanted, atol=2e-4)
+    rows, columns = np.mgrid[0:20, 0:40] + 0.5
+    np.testing.assert_allclose(
+        project(images, 0, 5 * local.reshape(-1, 3)), np.stack([columns, rows], -1).reshape(-1, 2), atol=0.01
+    )
 
 
 @pytest.mark.parametrize(
-    ("kind", "used"), [(CameraType.PERSPECTIVE, (0.1, 0.2, 0.5, 0.6)), (CameraType.FISHEYE, (0.1, 0.2, 0.3, 0.4))]
+    ("kind", "used"), [(CameraType.PERSPECTIVE, (0.1, 0.2, 0.5, 0.6, 0.3)), (CameraType.FISHEYE, (0.1, 0.2, 0.3, 0.4))]
 )
 def test_a_lens_goes_to_colmap_in_its_order(kind, used):
-    images = posed_images(bare(), as_data(kind=kind, lens=LENS))
+    images = posed_images(bare(), as_data(kind=kind, lens=PERSPECTIVE if kind is CameraType.PERSPECTIVE else LENS))
     assert images is not None and images.is_fisheye(1) == (kind is CameraType.FISHEYE)
-    assert images.distortion == pytest.approx(np.array([used, np.add(used, 1)]))
+    assert np.array([images.lens(i) for i in range(2)]) == pytest.approx(np.array([used, np.add(used, 1)]))
     assert [str(f) for f in images.files] == ["a/x.png", "b/x.png"] and np.array_equal(images.sizes, SIZES)
     assert not posed_images(bare(), as_data(kind=kind)).distortion.any()
 
