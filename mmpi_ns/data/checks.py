@@ -35,6 +35,8 @@ WHOLE_SPHERE = {"fl_x": 0.5, "fl_y": 1.0}
 CAMERA = {"w": Number(1, 65536), "h": Number(1, 65536), **dict.fromkeys(("fl_x", "fl_y"), Number(0, above=True))}
 CAMERA |= {"cx": Number(), "cy": Number()}
 """Intrinsics that every image needs, and their values."""
+MODELS = {name: kind for name, kind in CAMERA_MODEL_TO_TYPE.items() if not name.startswith(("OMNI", "VR180"))}
+"""Camera models; the others are for rendering alone: nerfstudio makes no rays of their single pixels."""
 RADIAL = ("k1", "k2", "k3", "k4")
 STRETCH = 10.0
 """Distortion that displaces a point half way to a corner by more than this factor is a mistake."""
@@ -163,10 +165,11 @@ def check_places(
 def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Checks the intrinsics of every camera; as in nerfstudio, a value for all frames overrides that of a frame."""
     model = meta.get("camera_model", "OPENCV")
-    if not isinstance(model, str) or model not in CAMERA_MODEL_TO_TYPE:
-        models = ", ".join(CAMERA_MODEL_TO_TYPE)
-        raise InputError(f"The camera_model of {path} is {as_text(model)}: give one of {models}.")
-    kind = CAMERA_MODEL_TO_TYPE[model]
+    if not isinstance(model, str) or model not in MODELS:
+        raise InputError(f"The camera_model of {path} is {as_text(model)}: give one of {', '.join(MODELS)}.")
+    kind = MODELS[model]
+    if meta.get("fisheye_crop_radius") is not None and "FISHEYE" in kind.name:
+        log_once(f"The fisheye_crop_radius of {path} is not used: mask what lies outside it (mask_path).")
     if meta.get("is_fisheye") is True and kind != CameraType.FISHEYE:
         raise InputError(
             f"{path} is of instant-ngp (is_fisheye): name its data parser after the options (ns-train mmpi "

@@ -207,7 +207,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         cameras, seen = self.train_dataset.cameras, self.observations
         sizes = sorted({(int(w), int(h)) for w, h in zip(cameras.width.view(-1), cameras.height.view(-1), strict=True)})
         shapes = f"{sizes[0][0]} x {sizes[0][1]}" + (f" to {sizes[-1][0]} x {sizes[-1][1]}" if len(sizes) > 1 else "")
-        parts = [f"{len(cameras)} training and {len(self.eval_dataset)} test images of {shapes}"]
+        parts = [f"{len(cameras)} training and {len(self._test_images)} test images of {shapes}"]
         if len(seen.points):
             parts.append(f"{len(seen.points):,} points seen {len(seen.seen_by):,} times")
         if self.priors is not None and self.priors.depths is not None:

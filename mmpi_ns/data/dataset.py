@@ -50,6 +50,12 @@ class MMPIDataset(InputDataset):
         self.mask_files = dataparser_outputs.mask_filenames or [None] * len(dataparser_outputs.image_filenames)
         # Masks are read here: nerfstudio's data set would ask for one of each image.
         super().__init__(replace(dataparser_outputs, mask_filenames=None), scale_factor)
+        self.mask_color = None  # masked pixels are not used, whatever their colour
+
+    def reduced_size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Width and height of a file of this size when it is read, rounded as cameras are, in 32 bits."""
+        width, height = (np.array(size, np.float32) * np.float32(self.scale_factor)).astype(int).tolist()
+        return width, height
 
     @property
     def has_masks(self) -> bool:
@@ -70,8 +76,8 @@ class MMPIDataset(InputDataset):
                 pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         if self.scale_factor == 1.0:
             return pixels
-        size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
-        return np.array(Image.fromarray(pixels).resize(size, resample=Image.Resampling.BILINEAR))
+        small = Image.fromarray(pixels)
+        return np.array(small.resize(self.reduced_size(small.size), resample=Image.Resampling.BILINEAR))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where any image has one."""
@@ -84,8 +90,7 @@ class MMPIDataset(InputDataset):
                 with Image.open(file) as image:
                     gray = image.convert("L") if image.mode == "P" else image  # the numbers of a palette are no shades
                     if self.scale_factor != 1.0:
-                        width, height = (int(side * self.scale_factor) for side in gray.size)
-                        gray = gray.resize((width, height), resample=Image.Resampling.NEAREST)
+                        gray = gray.resize(self.reduced_size(gray.size), resample=Image.Resampling.NEAREST)
                     shades = np.array(gray)
                 if shades.ndim != 2:
                     raise ValueError("it has several channels")
@@ -118,7 +123,7 @@ class MMPIDataset(InputDataset):
                 raise InputError(f"Depth image {file} cannot be read ({brief(error)}): repair or remove it.") from error
         for i, name in enumerate(self.image_filenames):
             with opened(name) as image:
-                columns, rows = (int(side * self.scale_factor) for side in image.size)
+                columns, rows = self.reduced_size(image.size)
             self._checked_size(i, rows, columns)
 
     def _checked_size(self, image_idx: int, rows: int, columns: int) -> tuple[int, int]:

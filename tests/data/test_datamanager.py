@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
-from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
+from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, edit, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, in_capture_frame
 
 from mmpi_ns.data import rays
@@ -76,10 +77,27 @@ def test_a_batch_holds_the_colours_of_the_pixels_that_its_rays_pass(manager):
 
 
 def test_masked_pixels_are_never_drawn(tmp_path):
-    manager = datamanager(write_scene(tmp_path / "masked", masks=True))
+    parser = NerfstudioDataParserConfig(mask_color=(0.0, 0.0, 0.0))
+    manager = datamanager(write_scene(tmp_path / "masked", masks=True), dataparser=parser)
     assert len(manager.sources.pixels.colors) == len(TRAIN) * WIDTH * HEIGHT / 2
     columns = torch.cat([manager.next_train(step)[1]["indices"][:, 2] for step in range(20)])
     assert columns.max() == WIDTH / 2 - 1 and columns.min() == 0
+
+
+def test_images_are_reduced_to_the_sizes_of_their_cameras(tmp_path):
+    """0.35 * 360 is 126 in 32 bits, and less in 64."""
+    data, (width, height) = write_scene(tmp_path / "reduced", sfm=False), (480, 360)
+    for i in range(8):
+        Image.fromarray(np.zeros((height, width, 3), np.uint8)).save(data / "images" / name_of(i))
+    edit(data, lambda meta: meta.update(w=width, h=height, cx=240, cy=180, fl_x=400, fl_y=400))
+    manager = datamanager(data, "test", camera_res_scale_factor=0.35)
+    assert manager.train_dataset[0]["image"].shape == (126, 168, 3)
+
+
+def test_a_capture_without_test_images_counts_none(tmp_path):
+    data = write_scene(tmp_path / "all")
+    edit(data, lambda meta: meta.update(val_filenames=[], test_filenames=[]))
+    assert datamanager(data).describe().startswith(f"Capture: {len(TRAIN)} training and 0 test images")
 
 
 def test_masks_that_leave_nothing_are_refused(tmp_path):

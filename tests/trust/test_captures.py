@@ -86,6 +86,7 @@ REFUSED = {
     "cx outside the image": (file(cx=960), ["principal point cx", "960", "outside the image of 32"]),
     # Lenses
     "unknown camera model": (file(camera_model="PINHOLE2"), ["camera_model", "'PINHOLE2'", "OPENCV_FISHEYE"]),
+    "a camera of renderings": (file(camera_model="VR180_L"), ["camera_model", "'VR180_L'", "OPENCV_FISHEYE"]),
     "fisheye of instant-ngp": (file(is_fisheye=True), ["instant-ngp-data", "OPENCV_FISHEYE"]),
     "k1 is NaN": (file(k1=NAN), ["distortion k1", "nan"]),
     "k1 is huge": (file(k1=1e6), ["distortion", "cannot be undone"]),
@@ -160,6 +161,11 @@ RUNS = {
 def test_a_capture_that_is_odd_and_usable_trains(data, edit, tmp_path, case):
     edit(RUNS[case])
     assert "Training finished" in train(data, tmp_path).printed
+
+
+def test_a_fisheye_whose_borders_are_black_is_told_to_need_masks(data, edit, tmp_path):
+    edit(file(camera_model="OPENCV_FISHEYE", fisheye_crop_radius=10.0))
+    assert "The fisheye_crop_radius" in (said := train(data, tmp_path).printed) and "mask what lies outside it" in said
 
 
 def test_test_images_that_are_trained_on_are_told(data, edit, tmp_path):
