@@ -111,7 +111,13 @@ class BakedScene:
         """The field's outputs for rays, as ``BakedWindow.render``, of the windows that they start in, mixed as in the
         model."""
         places, windows = zip(*self.windows, strict=True)
-        return render_windows(origins, places, lambda w, rays: windows[w].render(origins[rays], directions[rays]))
+
+        def render(w: int, rays: Tensor) -> dict[str, Tensor]:
+            outputs = windows[w].render(origins[rays], directions[rays])
+            outputs["winning_mpi"] += sum(len(window.mpis.mpis) for window in windows[:w])
+            return outputs
+
+        return render_windows(origins, places, render)
 
 
 def write_baked(scene: BakedScene, folder: Path) -> int:

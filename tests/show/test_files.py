@@ -51,6 +51,9 @@ def test_windows_are_mixed_by_their_shares():
     torch.testing.assert_close(rendered, (parts[0] + parts[1]) / 2, atol=1e-5, rtol=0)
     at_first = scene.render(origins - 2, directions)["rgb"]
     torch.testing.assert_close(at_first, a.render(origins - 2, directions)["rgb"])
+    beyond = origins + torch.tensor([2.0, 0.0, 0.0])  # winners are counted through all windows, as Scene.mpis
+    winners = scene.render(beyond, directions)["winning_mpi"] - len(a.mpis.mpis)
+    assert torch.equal(winners, b.render(beyond, directions)["winning_mpi"])
 
 
 def edit(folder, **changes):
