@@ -11,6 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.models.base_model import Model
+from nerfstudio.utils.math import intersect_obb
 from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
@@ -156,10 +157,8 @@ class MMPIModel(Model):
         ``chunk``: rays that a window renders at once; None: all."""
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
-        present = [*range(trained + 1)]  # finished windows, and the one being trained
 
-        def render(place: int, rays: Tensor | slice) -> dict[str, Tensor]:
-            window = present[place]
+        def render(window: int, rays: Tensor | slice) -> dict[str, Tensor]:
             field = self.field if window == trained else self.store.load(window, self.device)
             return render_in_chunks(
                 bundle[rays], chunk or len(bundle), self.device,
@@ -168,9 +167,9 @@ class MMPIModel(Model):
 
         if len(windows) == 1:
             return render(0, slice(None))
-        only = present.index(chosen[0]) if chosen is not None and chosen[0] in present else None
-        in_memory = [i for i, window in enumerate(present) if window in (trained, *self.store.in_memory)]
-        return render_windows(bundle.origins, tuple(windows.windows[w] for w in present), render, only, in_memory)
+        there = windows.windows[: trained + 1]  # finished windows, and the one being trained
+        only = chosen[0] if chosen is not None and chosen[0] <= trained else None
+        return render_windows(bundle.origins, there, render, only, (trained, *self.store.in_memory))
 
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
@@ -203,9 +202,11 @@ class MMPIModel(Model):
         width, height = int(camera.width), int(camera.height)
         if min(width, height) < 1:
             raise InputError(f"An image of {width} x {height} pixels shows nothing: give a smaller --downscale-factor.")
+        bundle = image_rays(camera.to(self.device))  # nerfstudio's rays have NaN in the centre of a fisheye
         if obb_box is not None:
-            return super().get_outputs_for_camera(camera, obb_box)
-        return self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))
+            ends = intersect_obb(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3), obb_box)
+            bundle.nears, bundle.fars = (t.view(*bundle.shape, 1) for t in ends)
+        return self.get_outputs_for_camera_ray_bundle(bundle)
 
     @torch.no_grad()
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:

@@ -98,6 +98,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
         """Rays of the next step with their sources, step and number."""
         parser: Any = config.dataparser
+        factor = getattr(parser, "downscale_factor", None)
+        if isinstance(factor, float) and factor.is_integer():  # ns-render dataset gives 2.0
+            parser.downscale_factor = int(factor)
         if isinstance(parser, NerfstudioDataParserConfig):
             opens = kwargs.get("test_mode", "val") != "inference"
             check_transforms(parser, Path(config.data or parser.data), opens=opens)

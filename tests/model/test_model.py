@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torchmetrics.image.lpip
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from random_scenes import dense_grad
 from tiny_scene import HEIGHT, WIDTH, write_scene
@@ -179,6 +180,8 @@ def test_a_crop_shows_the_background_around_a_box(model, camera):
     assert (cropped["accumulation"][misses] == 0).all() and (cropped["rgb"][misses] == 0.5).all()
     assert cropped["accumulation"][~misses].max() > 0.05 and torch.isfinite(cropped["depth"]).all()
     assert (cropped["accumulation"] <= outputs["accumulation"] + 1e-4).all()
+    fisheye = Cameras(camera.camera_to_worlds, 20.0, 20.0, 10.5, 10.5, 21, 21, camera_type=CameraType.FISHEYE)
+    assert torch.isfinite(model.get_outputs_for_camera(fisheye, obb_box=box)["rgb"]).all()  # also in its centre
 
 
 def test_the_viewer_can_show_one_mpi_alone(model, camera):

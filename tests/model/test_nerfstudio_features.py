@@ -58,6 +58,18 @@ def test_raw_depth_of_ns_render_is_in_the_units_of_the_capture(run, tmp_path):
         assert relative_error(np.load(gzip.open(file))[..., 0], i) < 0.15
 
 
+def test_ns_render_takes_the_copies_of_a_downscale_factor(run, tmp_path):
+    """Its option is a number with a decimal point: 2 on the command line becomes 2.0."""
+    data = run.config.pipeline.datamanager.data
+    (data / "images_2").mkdir()
+    for file in (data / "images").iterdir():
+        Image.open(file).reduce(2).save(data / "images_2" / file.name)
+    config, names = run.base_dir / "config.yml", ["rgb", "gt-rgb"]
+    DatasetRender(config, output_path=tmp_path, downscale_factor=2.0, rendered_output_names=names).main()
+    pictures = [Image.open(file) for file in tmp_path.rglob("*.jpg")]
+    assert [picture.size for picture in pictures] == [(WIDTH // 2, HEIGHT // 2)] * 2 * len(TEST)
+
+
 # Pictures, points and curves -----------------------------------------------------------------------------------------
 
 
