@@ -92,5 +92,5 @@ results: venv ## Make every number of README.md and docs/results (hours; what is
 	$(BIN)/python benchmarks/results.py --data $(DATA) $(ARGS)
 
 clean: ## Remove build products and caches (not .venv)
-	rm -rf build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
-	find mmpi_ns mmpi_scene benchmarks examples tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf build dist site *.egg-info .pytest_cache .ruff_cache
+	find mmpi_* benchmarks examples tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -72,11 +72,11 @@ class DepthsBench(Bench):
 def depths_of(data: Path, downscale_factor: int) -> Row:
     """Share of the training pixels whose depth is known, and the errors where the true one is known, too."""
     config: Any = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
-    config.data, config.correct_exposure, config.new_view_share = data, False, 0.0
-    config.mask_moving, config.depth_images, config.dataparser.downscale_factor = False, False, downscale_factor
+    config.data, config.new_view_share, config.dataparser.downscale_factor = data, 0.0, downscale_factor
+    config.priors.correct_exposure = config.priors.mask_moving = config.priors.depth_images = False
     start = time.process_time()
     manager = config.setup(device="cpu", test_mode="val")
-    seconds, dataset, known = time.process_time() - start, manager.train_dataset, manager.depth_priors
+    seconds, dataset, known = time.process_time() - start, manager.train_dataset, manager.priors.depths
     assert known is not None
     count = len(dataset)
     row: Row = {"images": count, "seconds_an_image": seconds / count, "share": known.share}

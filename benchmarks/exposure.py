@@ -88,11 +88,11 @@ class ExposureBench(Bench):
 def calibration(data: Path, downscale_factor: int) -> Row:
     """Gains of a capture's training images: whether they are used, and their errors where they are known."""
     config: Any = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
-    config.data, config.correct_exposure, config.new_view_share = data, False, 0.0
+    config.data, config.priors.correct_exposure, config.new_view_share = data, False, 0.0
     config.dataparser.downscale_factor = downscale_factor
     manager = config.setup(device="cpu", test_mode="val")
     start = time.process_time()
-    gains = manager.calibrated()
+    gains = manager.maker.gains(manager.priors.observations, manager.priors.depths)
     row: Row = {"images": len(manager.train_dataset), "seconds_an_image": time.process_time() - start}
     row["seconds_an_image"] /= row["images"]
     if gains is None:

@@ -11,7 +11,6 @@ from trainers import BARE, P, Scene, train_words
 
 TWO_PHASE = ("--pipeline.model.schedule.training", "two-phase")
 """All rays for each MPI, a little blending, and a long fine-tune at full rates, unless more options follow."""
-SPLIT = ("--pipeline.model.schedule.rays-per-mpi", "split")
 NO_DEPTH = (
     *("--pipeline.datamanager.keypoint-rays", "0"),
     *("--pipeline.datamanager.priors.dense-depth", "False"),

@@ -12,7 +12,7 @@ import json
 import shlex
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -81,16 +81,14 @@ class Request:
         return shlex.join(w for i, w in enumerate(self.words) if not {w, *self.words[max(i - 1, 0) : i]} & hidden)
 
 
-def train_apart(
-    request: Request, threads: int, seconds: float | None = None, extra: Mapping[str, str] | None = None
-) -> dict[str, Any]:
-    """The row of a training in a fresh process, or why there is none; the rest as for ``run_apart``."""
-    variables = dict(extra or {})
+def train_apart(request: Request, threads: int) -> dict[str, Any]:
+    """The row of a training in a fresh process, or why there is none."""
+    variables = {}
     if request.quick_hashes:  # else half of nerfacto's time goes into fetching the same pages from the system again
         variables |= {"MALLOC_MMAP_THRESHOLD_": str(8 * 10**9), "MALLOC_TRIM_THRESHOLD_": str(16 * 10**9)}
     if request.go_on:  # nerfstudio's checkpoints hold numpy scalars, which torch refuses unless told otherwise
         variables["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"
-    return run_apart(train, asdict(request), Path(request.work), threads, seconds, variables)
+    return run_apart(train, asdict(request), Path(request.work), threads, extra=variables)
 
 
 @dataclass

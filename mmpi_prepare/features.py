@@ -29,7 +29,7 @@ DATABASE = "database.db"
 BATCH, PAIR_BATCH = 8, 64
 """Images extracted, and pairs matched, at a time: the most that an interruption loses."""
 LARGEST_SIDE = 2000
-"""Larger images are reduced to this side for SIFT (docs/prepare.md has time and error by size)."""
+"""Larger images are reduced to this side for SIFT."""
 PIXELS_A_FEATURE, LEAST_FEATURES = 100, 2048
 """At most one feature for this many pixels, but small images may have the second number: more are redundant, and the
 cost of matching is quadratic."""

@@ -61,7 +61,8 @@ class CapturePriors(PriorsMaker):
             self.outputs, observations, dataset, self.rays, dense=config.dense_depth, sensor=config.depth_images
         )
         placement = observations if depths is None else of_cells(observations, depths, dataset)
-        gains = self._gains(observations, depths) if config.correct_exposure else None
+        gains = self.gains(observations, depths) if config.correct_exposure else None
+        gains = gains if gains and gains.matter else None
         priors = Priors(observations, placement, depths, dataset.moving, movers, gains)
         return Priors(**{**vars(priors), "new_views": lambda *chosen: self._new_views(priors, *chosen)})
 
@@ -73,7 +74,7 @@ class CapturePriors(PriorsMaker):
             return [np.zeros(shape, bool) for shape in shapes], ""
         return moving_masks(at_full_size(posed), shapes, *observations.tracked)
 
-    def _gains(self, observations: Observations, depths: DepthPriors | None) -> Gains | None:
+    def gains(self, observations: Observations, depths: DepthPriors | None) -> Gains | None:
         """Exposures of the training images; None if they are equal."""
         posed = posed_images(observations, self.dataset)
         if depths is None or posed is None or len(posed.files) < 2:
@@ -87,7 +88,7 @@ class CapturePriors(PriorsMaker):
             return None
         gains = image_gains(ratios, len(posed.files), light)
         log(gains.describe())
-        return gains if gains.matter else None
+        return gains
 
     def _new_views(
         self,

@@ -1,4 +1,4 @@
-"""Stored form of the codes of bricks: differences from neighbouring codes, which gzip compresses well (docs/export.md).
+"""Stored form of the codes of bricks: differences from neighbouring codes, which gzip compresses well.
 
 Every second row and column of a brick is stored first: with these, a page renders the brick at half of its resolution.
 Nothing is stored twice. ``reader.py`` joins them again.

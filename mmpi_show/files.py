@@ -265,8 +265,7 @@ def read_baked(folder: Path) -> BakedScene:
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> Scene:
-    """A scene written by ``mmpi-export bake`` or ``mmpi-export web``. It renders about twice as fast as the exact model
-    on a CPU and loses 0.01 dB (docs/export.md).
+    """A scene written by ``mmpi-export bake`` or ``mmpi-export web``; speed and loss of quality: docs/export.md.
 
     Args:
         path: the folder.

@@ -314,7 +314,7 @@ def replace_data(parameter: nn.Parameter, data: Tensor) -> None:
 def in_half_precision(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The state of a field that is trained, for its file: tables take half of the bytes, under whatever prefix.
 
-    Images change by a fraction of a grey level (docs/performance.md).
+    Images change by a fraction of a grey level.
     """
     tables = {name: x for name, x in state.items() if name.rpartition(".")[2] in TABLES}
     return dict(state) | {name: x.clamp(-HALF_LARGEST, HALF_LARGEST).half() for name, x in tables.items()}

@@ -19,8 +19,7 @@ GPU_MULTIPLE, RAYS_PER_PIXEL = 4.0, 4.0
 """Factor on the rays of a run on a GPU, up to so many per training pixel: beyond, images do not improve
 (docs/results/README.md, "Longer and shorter")."""
 RAYS_PER_PROCESSOR = 256
-"""Pixel rays of a step per multiprocessor of a GPU. Its registers hold eight programs of the march, of 16 rays each, so
-these and the rays of new views take about three rounds."""
+"""Pixel rays of a step per multiprocessor of a GPU."""
 MOST_RAYS_TIMES = 4
 """Maximum factor on a method's rays, by which steps are divided. The same rays in a quarter of the steps give equally
 good images, in an eighth worse ones."""

@@ -30,7 +30,7 @@ def rough_window():
 
 
 def expected_code(codes, y, x):
-    """What the format expects of a texel from those of its brick that are read before it (docs/export.md)."""
+    """What the format expects of a texel from those of its brick that are read before it."""
     at = lambda v, u: int(codes[v, u]) if v >= 0 and u >= 0 else 0  # noqa: E731
     if y % 2 == 0 and x % 2 == 0:
         return at(y, x - 2) + at(y - 2, x) - at(y - 2, x - 2)

@@ -19,7 +19,7 @@ NUMBERS = 512
 
 @triton.jit(do_not_specialize=("count",))
 def adam_kernel(
-    params, moments, rows, grads, correction, rate, count, channels, keep1, new1, keep2, new2, eps,
+    params, moments, rows, grads, correction, rate, count, channels, new1, keep2, new2, eps,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Update of the entries with a gradient other than 0, except for the empty brick."""
@@ -48,6 +48,6 @@ def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, consta
     correction, rate = (torch.as_tensor(x, dtype=torch.float32, device=device) for x in (correction, rate))
     columns = triton.next_power_of_2(channels)
     block = block_size(max(32, NUMBERS // columns), device)
-    betas = (beta1, 1 - beta1, beta2, 1 - beta2)
+    betas = (1 - beta1, beta2, 1 - beta2)
     tensors = (param, moments, rows.contiguous(), grad.contiguous(), correction, rate)
     launch(adam_kernel, len(rows), block, *tensors, len(rows), channels, *betas, eps, CHANNELS=columns, BLOCK=block)
