@@ -171,10 +171,10 @@ def crossings(
         w = sample_disparity(m_before, frames.disparity_steps, frames.last_disparities)
         oz, dz = hits.local_origins[..., 2], hits.local_directions[..., 2]
         starts_inside = w * oz >= 1
-        entry = torch.where(starts_inside, torch.inf, w * dz / torch.where(starts_inside, 1, 1 - w * oz))
+        entry = w * dz / torch.where(starts_inside, 1, 1 - w * oz)
         endless = intersected & (hits.m_first - counts[:, : len(layout.mpis)] < 0) & (frames.last_disparities == 0)
-        fully_covered &= (intersected & (entry * layout.content_near >= 1)).any(-1, keepdim=True)
-        fully_covered &= endless.any(-1, keepdim=True)
+        entered = intersected & (starts_inside | (entry * layout.content_near >= 1))
+        fully_covered &= entered.any(-1, keepdim=True) & endless.any(-1, keepdim=True)
     return first, counts, fully_covered
 
 

@@ -196,8 +196,7 @@ def _depth_sums(rays: RenderedRays, bundle: TrainingRays, field: MMPIField) -> D
     targets = bundle.origins.new_zeros(len(bundle), 2) if targets is None else targets
     # The spacing of planes in inverse distance: a surface between two is represented by both. Those of the densest MPI
     # count: one with few planes may stand at a camera, where they suffice.
-    spacings = [1 / (m.near * max(1, m.planes - 1)) for m in field.plan.mpis]
-    least = PLANE_ERROR * min(spacings, default=0.0)
+    least = PLANE_ERROR * min((m.disparity_step for m in field.plan.mpis), default=0.0)
     targets = torch.stack([targets[:, 0], (targets[:, 1] ** 2 + least**2).sqrt().clamp(min=1e-12)], -1)
     if (keypoints := bundle.keypoint_disparities) is not None:
         windows = torch.cat([keypoints, KEYPOINT_WIDTH * keypoints], -1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from dataclasses import replace
 
 import numpy as np
 import oracle
@@ -195,6 +196,8 @@ def test_a_ray_is_explained_when_it_enters_before_the_first_content_and_stays_to
     assert not ray_is_covered(one, [0, 0, 1.5], [1.3, 0, 1]), "leaves the frustum before infinity"
     assert not ray_is_covered(one, [-10, 0, 0], [0.9, 0, 1]), "enters far behind the first content"
     assert not ray_is_covered(one, [0, 0, -3], [0, 0, 1]), "reaches the first plane far behind the first content"
+    with dispatch.chosen("torch"):
+        assert ray_is_covered(replace(one, content_near=0.0), [0.4, 0.1, 3.0], [0.5, -0.2, 1]), "content at the camera"
 
 
 def test_without_other_heads_all_that_a_ray_shows_is_to_be_explained():

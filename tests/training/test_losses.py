@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from hand_made import make_mpi
 from random_fields import random_plan
 from training_runs import datamanager, plan_of, ready, trainer_config
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.variation import clamped_differences
+from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.training import losses
 from mmpi_ns.training.losses import depth_sums
 
@@ -182,6 +185,16 @@ def test_a_false_depth_pulls_no_harder_than_the_share_of_outliers_allows():
         (pull,) = torch.autograd.grad(depth_priors(weights, tensor([[2.0, 1.0]]), known, valid, 0.0, outliers), weights)
         pulls.append(-pull[0, 1].item())
     assert pulls == pytest.approx([1e4, 50, 5], rel=1e-4)
+
+
+def test_a_depth_is_at_most_as_exact_as_planes_are_dense_also_of_an_mpi_that_ends(monkeypatch):
+    plan = ScenePlan((make_mpi(near=1.0, far=1.25, planes=5),), None, 0.05, 1.0)  # planes 0.05 apart in 1 / depth
+    monkeypatch.setattr(losses, "depth_sums", lambda *args: args[4])
+    one = torch.ones(1, 1)
+    samples = SimpleNamespace(num_intersected=one[0], inverse_t=one, valid=one > 0)
+    rays = SimpleNamespace(samples=samples, composite=SimpleNamespace(weights=one), rgb=one)
+    bundle = SimpleNamespace(disparities=torch.tensor([[1.0, 0.0]]), keypoint_disparities=None)
+    assert losses._depth_sums(rays, bundle, SimpleNamespace(plan=plan))[0, 1].item() == pytest.approx(0.6 * 0.05)
 
 
 def test_depth_priors_has_the_gradient_of_finite_differences_and_a_finite_one_without_mass():
