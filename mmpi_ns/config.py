@@ -52,7 +52,6 @@ def _method(
         method_name=name,
         max_num_iterations=steps,
         machine=MachineConfig(seed=0, device_type="cuda" if torch.cuda.is_available() else "cpu"),
-        steps_per_save=max(500, steps // 4),  # a run that follows the capture: a quarter of its steps, too
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,

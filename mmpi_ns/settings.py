@@ -229,6 +229,8 @@ class MMPITrainerConfig(TrainerConfig):
     max_num_iterations: int = 0
     """Steps of the whole run, resumed or not; if a long capture is split into windows, of each window. 0: as many as
     its pixels need (2,500 to 12,000, times --pipeline.model.size)."""
+    steps_per_save: int = 0
+    """Steps between checkpoints; 0: a quarter of a window's, at least 500."""
     graphs: bool = True
     """On a GPU: replay steps as CUDA graphs, several times faster than one operation at a time (docs/gpu.md)."""
 

@@ -113,14 +113,16 @@ def check_same_run(
     data: Path,
     observations: Observations,
     plan: WindowedPlan,
+    steps_here: int,
     pose_mode: str,
     rays: dict[str, int] | None,
 ) -> None:
-    """Raises InputError if a run of this capture, its training cameras, plan and mode of the camera optimiser cannot
-    resume from a checkpoint, read from ``path``. ``rays``: of a step; None if they do not follow the device."""
+    """Raises InputError if a run of this capture, its training cameras, plan, steps of each of several windows and mode
+    of the camera optimiser cannot resume from a checkpoint, read from ``path``. ``rays``: of a step; None if they do
+    not follow the device."""
     drawn = state["rays"]
+    steps = Schedule.from_json(to_text(state["pipeline"]["_model.progress.schedule_bytes"])).window_steps
     if rays is not None and drawn != rays:
-        steps = Schedule.from_json(to_text(state["pipeline"]["_model.progress.schedule_bytes"])).window_steps
         raise InputError(
             f"{path} is of a run of {steps:,} steps of {drawn['pixel']:,} rays, and {rays['pixel']:,} a step suit "
             f"this device: resume with --max-num-iterations {steps} --pipeline.datamanager.train-num-rays-per-batch "
@@ -138,6 +140,8 @@ def check_same_run(
             f"{path} was trained with another scene plan: resume with the settings in its config.yml, or give its "
             f"{PLAN_FILE} with --pipeline.model.plan-file."
         )
+    if len(plan) > 1 and steps != steps_here:
+        raise InputError(f"{path} has {steps:,} steps a window: resume with --max-num-iterations {steps}.")
     if ("_model.camera_optimizer.pose_adjustment" in state["pipeline"]) == (pose_mode == "off"):
         there, as_there = ("unrefined", "off") if pose_mode != "off" else ("refined", "SO3xR3")
         raise InputError(

@@ -135,8 +135,7 @@ class MMPITrainer(Trainer):
         self._window_steps = progress.schedule.window_steps
         # Rays of a step by kind; those of new views follow the pixels'.
         self._rays = {"pixel": manager.config.train_num_rays_per_batch, "keypoint": manager.config.keypoint_rays}
-        if self._follows_capture:
-            self.config.steps_per_save = max(self.config.steps_per_save, self._window_steps // 4)
+        self.config.steps_per_save = self.config.steps_per_save or max(500, self._window_steps // 4)
         self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps  # nerfstudio shows these
         optimizers = Optimizers(self.config.optimizers, self.pipeline.get_param_groups())
         for kind, optimizer in optimizers.optimizers.items():
@@ -301,7 +300,7 @@ class MMPITrainer(Trainer):
         path, run = checkpoint_to_load(self.config), self._run
         if path is not None:
             state, capture, model = read_checkpoint(path), self._manager, cast(Any, self.pipeline.model)
-            here = (capture.get_datapath(), capture.observations, run.progress.windows)
+            here = (capture.get_datapath(), capture.observations, run.progress.windows, self._window_steps)
             rays = self._rays if self._follows_capture else None
             check_same_run(state, path, *here, model.camera_optimizer.config.mode, rays)
             torch.set_rng_state(state["rng"]["torch"])
@@ -313,6 +312,7 @@ class MMPITrainer(Trainer):
         self.config.load_dir, self.config.load_checkpoint = asked, asked_for
         if path is not None:
             progress = run.progress
+            run.field.views = views_of(progress.windows.windows[progress.window], run.views)
             finished = progress.schedule.window_at(self._start_step)
             run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished)
 

@@ -252,4 +252,5 @@ def test_without_a_number_of_steps_they_follow_the_pixels(scene, plan_file, tmp_
     trainer = ready(config)
     expected = steps or 300
     assert trainer.pipeline.model.progress.schedule.total_steps == expected == trainer.config.max_num_iterations
+    assert trainer.config.steps_per_save == 1, "as given"
     assert ("300 steps for its training pixels" in capsys.readouterr().out) == (steps == 0)

@@ -124,10 +124,17 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, scene, windows_file,
     trainer.train()
     actual, wanted = (load(t.checkpoint_dir, 2 * STEPS - 1) for t in (trainer, whole))
     assert differences(compared(wanted), compared(actual)) == []
+    assert torch.equal(*(t.pipeline.model.field.views.origins for t in (trainer, whole))), "texels grow where it looks"
     ours, theirs = (
         torch.load(t.base_dir / "windows" / "window-00000.pt", weights_only=True)["field"] for t in (trainer, whole)
     )
     assert differences(ours, theirs) == []
+
+
+def test_resuming_with_other_steps_a_window_is_refused(whole, scene, windows_file, tmp_path):
+    config = trainer_config(scene, windows_file, tmp_path, STEPS // 2, training="joint")
+    with pytest.raises(ValueError, match=f"resume with --max-num-iterations {STEPS}"):
+        ready(config, load_dir=whole.checkpoint_dir, load_step=2)
 
 
 def test_resuming_without_the_finished_windows_is_refused_in_one_sentence(whole, scene, windows_file, tmp_path):
