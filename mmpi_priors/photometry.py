@@ -242,9 +242,10 @@ def solve(
         scale = max(1.0, 1.4826 * float(np.median(np.abs(residuals))))
         weights = 1 / (1 + (residuals / (2 * scale)) ** 2)
     logs = solution[:count] - solution[:count].mean(0)
-    # Without the error of the mean, which no ratio determines and no image needs.
-    center = np.eye(count) - 1 / count
-    covariance = center @ np.linalg.inv(normal)[:count, :count] @ center
+    # Without the error of the matched images' mean, which no ratio determines and no image needs.
+    matched = np.isin(np.arange(count), [ratios.first, ratios.second])
+    center = np.eye(count) - matched / max(1, matched.sum())
+    covariance = center @ np.linalg.inv(normal)[:count, :count] @ center.T
     return logs, np.sqrt(np.maximum(np.diag(covariance), 0)) * scale, solution[count : count + 2]
 
 
