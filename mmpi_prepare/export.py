@@ -107,16 +107,15 @@ def transforms(
 def write_images(
     images: Path, masks: Path | None, photos: Sequence[Photo], scene: Path, factors: Sequence[int]
 ) -> None:
-    """Images, masks under the stems of their images, and downscaled copies of both. Complete files are kept."""
+    """Images, masks under the stems of their images, and downscaled copies of both."""
     with progress("Writing images", len(photos)) as advance:
         for photo in photos:
             files = [(images / photo.name, "images", photo.name)]
             files += [(masks / f"{photo.name}.png", "masks", f"{Path(photo.name).stem}.png")] if masks else []
             for source, folder, name in files:
                 target = scene / folder / name
-                if not target.exists():
-                    with whole(target) as partial:
-                        shutil.copyfile(source, partial)
+                with whole(target) as partial:
+                    shutil.copyfile(source, partial)
                 for factor in factors:
                     downscale(target, scene / f"{folder}_{factor}" / name, factor, mask=folder == "masks")
             advance(1)
@@ -127,8 +126,6 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
 
     A pixel of a mask that contains a masked one is masked. JPEG is written at high quality.
     """
-    if target.exists():
-        return
     with Image.open(source) as image:
         tags = kept_tags(image)
         width, height = (n // factor * factor for n in image.size)
