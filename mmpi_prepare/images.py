@@ -99,7 +99,7 @@ def in_short(names: Sequence[str], most: int = 4) -> str:
 
 def natural_key(text: str) -> list[tuple[int, int | str]]:
     """Sort key by which 9 comes before 10."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", text) if part]
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part]
 
 
 def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
@@ -109,9 +109,9 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
     photos, used = [], set()
     with progress("Reading images", len(files)) as advance:
         for file in files:
-            # COLMAP takes UTF-8 and splits its list of pairs at blanks; masks and downscaled copies go by the stem.
+            # COLMAP takes UTF-8; in its list of pairs blanks separate and # begins a comment. Masks go by the stem.
             stem = "-".join(file.relative_to(folder).with_suffix("").parts).encode("utf-8", "replace").decode()
-            stem = re.sub(r"[\s?]+", "_", stem)
+            stem = re.sub(r"[\s?#]+", "_", stem)
             while stem.lower() in used:
                 stem += "_"
             used.add(stem.lower())

@@ -71,7 +71,7 @@ class Preparation:
         log(f"Matching: {self.matching}.")
         names = [p.name for p in self.photos]
         self.is_ordered = self.is_video or features.are_in_order(folder / features.DATABASE, names)
-        source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
+        source = [s.poses_axes, s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
         folder, self.mapped = self._stage("model", source, partial(self._map, folder / features.DATABASE))
         model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
         count, total = model.num_reg_images(), len(self.photos)

@@ -97,7 +97,7 @@ class GivenPoses:
     intrinsics: dict[str, pycolmap.Camera] = field(default_factory=dict)
     """Intrinsics of the same images, from a transforms.json."""
     split: dict[str, Any] | None = None
-    """A transforms.json's lists of files."""
+    """A transforms.json's lists of files, by the names of the images."""
     axes: Array = field(default_factory=lambda: np.eye(3))
     """The axes that the file's matrices are taken to have, as in ``conventions.py``."""
 
@@ -255,9 +255,13 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> GivenPoses:
                 cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
                 values = (fx * sx, fy * sy, cx * sx, cy * sy, *(float(frame.get(k, 0.0)) for k in keys))
                 intrinsics[photo.name] = opencv_camera(values, fisheye)
+        lists, named = ("train_filenames", "test_filenames"), {files[n]: name for name, n in places.items()}
+        is_split = all(key in meta for key in lists)
+        split = {key: [named.get(Path(f), f) for f in meta[key]] for key in lists} if is_split else None
+    except InputError:
+        raise
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
-    split = meta if "train_filenames" in meta and "test_filenames" in meta else None
     return GivenPoses(poses, "poses of a transforms.json, by name", intrinsics, split)
 
 

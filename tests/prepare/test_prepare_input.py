@@ -33,15 +33,16 @@ def save(path, size=(40, 30), value=100, **more):
 
 
 def test_images_come_in_natural_order(tmp_path):
-    for n in (10, 9, 1):
-        save(tmp_path / f"f{n}.jpg")
-    assert [p.name for p in find_images(tmp_path)] == ["f1.jpg", "f9.jpg", "f10.jpg"]
+    names = ["f1.jpg", "f1²2.jpg", "f9.jpg", "f10.jpg"]
+    for name in names:
+        save(tmp_path / name)
+    assert [p.name for p in find_images(tmp_path)] == names
 
 
 def test_names_of_subfolders_stay_apart(tmp_path):
-    files = [save(tmp_path / f) for f in ("left/a 1.jpg", "right/a 1.jpg", "right/a 1.png")]
+    files = [save(tmp_path / f) for f in ("left/a 1.jpg", "right/a 1.jpg", "right/a 1.png", "#1.jpg")]
     names = [photo.name for photo in gather(tmp_path, files, tmp_path / "out")]
-    assert names == ["left-a_1.jpg", "right-a_1.jpg", "right-a_1_.png"]
+    assert names == ["left-a_1.jpg", "right-a_1.jpg", "right-a_1_.png", "_1.jpg"]
 
 
 def test_turned_photo_is_set_upright_and_its_focal_length_read(tmp_path):

@@ -92,7 +92,11 @@ def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_pa
     known, _ = read(write_transforms(path, GIVEN, **lens, k4=0.6, camera_model="OPENCV_FISHEYE"))
     assert opencv_intrinsics(known.intrinsics["frame_008.png"]) == ([*wanted, 0.5, 0.6], True)
     assert known.split is None
-    with pytest.raises(InputError, match="says otherwise"):
+    renamed = [replace(p, name=f"left-{p.name}", source=f"left/{p.name}") for p in PHOTOS]
+    lists = {key: [f"elsewhere/frame_00{n}.png"] for n, key in enumerate(lists, 1)}
+    known = read_poses(write_transforms(path, GIVEN, **lists), "auto", renamed)
+    assert known.split == {"train_filenames": ["left-frame_001.png"], "test_filenames": ["left-frame_002.png"]}
+    with pytest.raises(InputError, match=r"^frame_001\.png is 240x160"):
         read(write_transforms(path, GIVEN, w=400))
 
 
@@ -161,10 +165,10 @@ def test_refining_brings_disturbed_poses_back(frames, tmp_path):
 
 def test_poses_with_other_axes_are_read_so_or_refused_where_axes_were_given(frames, tmp_path, capsys):
     poses = write_kitti(tmp_path / "poses.txt", np.linalg.inv(GIVEN @ FLIP))
-    how = Settings(frames, tmp_path / "scene", poses=poses, focal=corridor.FOCAL, threads=1)
-    with pytest.raises(InputError, match="--poses-axes"):
-        prepare(replace(how, poses_axes="opencv"))
+    how = Settings(frames, tmp_path / "scene", poses=poses, focal=corridor.FOCAL, threads=1, keep_work=True)
     assert prepare(how).grade == "right"
+    with pytest.raises(InputError, match="--poses-axes"):  # not the model that is kept
+        prepare(replace(how, poses_axes="opencv", overwrite=True))
     said = "have OpenGL's camera axes (x right, y up, z back) and are world to camera, not camera to world"
     assert said in capsys.readouterr().out.replace("\n", " ")
     model = pycolmap.Reconstruction(tmp_path / "scene/colmap/sparse/0")
