@@ -14,6 +14,7 @@ from mmpi_ns.placement.rule import place
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.settings import PlacementConfig
+from mmpi_ns.utils.errors import InputError
 
 MARGIN = 0.08
 """Distance over which the share of a window falls off, as a fraction of the windows' length."""
@@ -38,12 +39,12 @@ def place_windows(
     return WindowedPlan(tuple(replace(ball, plan=plan) for ball, plan in zip(balls, plans, strict=True)))
 
 
-def most_pixels(observations: Observations, config: PlacementConfig) -> float:
-    """Training pixels of the largest window of a capture."""
-    balls = find_balls(observations, config.window_length)
+def most_pixels(observations: Observations, config: PlacementConfig, given: WindowedPlan | None = None) -> float:
+    """Training pixels of the largest window of a given plan, or of the capture as it is split."""
+    windows = find_balls(observations, config.window_length) if given is None else given.windows
     pixels = observations.sizes.prod(-1)
-    windows = [cameras_of(ball, observations.centers) for ball in balls]
-    return float(max((pixels[cameras].sum() for cameras in windows), default=pixels.sum()))
+    cameras = (cameras_of(window, observations.centers) for window in windows)
+    return float(max((pixels[some].sum() for some in cameras), default=pixels.sum()))
 
 
 def find_balls(observations: Observations, length: float) -> list[Window]:
@@ -82,13 +83,19 @@ def find_balls(observations: Observations, length: float) -> list[Window]:
         order.append(min(left, key=lambda i: float(np.linalg.norm(middles[i] - at))))
         left.remove(order[-1])
         at = middles[order[-1]]
+    if 2 * max(radii) > SLACK * longest:  # sparse cameras: merged windows are longer, and so are the gaps between them
+        longest = 2 * max(radii)
     return [Window(vector(middles[i]), radii[i], MARGIN * longest, NO_PLAN) for i in order]
 
 
 def cameras_of(window: Window, centers: Array) -> NDArray[np.int64]:
-    """Cameras with a share in a window, which its placement and training use; all cameras if there is only one."""
+    """Cameras with a share in a window, which its placement and training use; all cameras if there is only one. Raises
+    InputError if there is none."""
     distance = np.linalg.norm(centers - np.asarray(window.center), axis=-1)
-    return np.nonzero(distance < window.radius + window.margin)[0]
+    cameras = np.nonzero(distance < window.radius + window.margin)[0]
+    if not len(cameras):
+        raise InputError(f"The plan's window at {window.center} holds no training camera: move it or leave it out.")
+    return cameras
 
 
 def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observations:

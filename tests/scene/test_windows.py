@@ -14,11 +14,12 @@ from training_runs import datamanager, schedule_of
 
 from mmpi_ns.placement.defaults import FEW, MANY, RAYS, rays_times, steps_for
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.split import find_balls, most_pixels, of_cameras, place_windows
-from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.placement.split import cameras_of, find_balls, most_pixels, of_cameras, place_windows
+from mmpi_ns.scene.plan import NO_PLAN, ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
 from mmpi_ns.settings import PlacementConfig, ScheduleConfig
 from mmpi_ns.training.phases import make_schedule
+from mmpi_ns.utils.errors import InputError
 
 # Splitting -----------------------------------------------------------------------------------------------------------
 
@@ -51,6 +52,7 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     one, windows = PlacementConfig(window_length=0.0), PlacementConfig(window_length=4.0)
     assert most_pixels(few, one) == few.sizes.prod(-1).sum() == most_pixels(few, windows)
     assert 0.05 < most_pixels(many, windows) / many.sizes.prod(-1).sum() < 0.5
+    assert most_pixels(many, windows, WindowedPlan.single(NO_PLAN)) == many.sizes.prod(-1).sum()
     steps = [steps_for(pixels) for pixels in (1e4, 0.75 * FEW, FEW, MANY, 2 * MANY, 1e12)]
     assert steps == [2500, 3000, 4000, 4000, 8000, 12000]
     assert [steps_for(FEW, size) for size in (0.3, 4.0)] == [1200, 16000]
@@ -143,6 +145,21 @@ def test_shares_change_steadily_along_the_way():
     assert shares.diff(dim=0).abs().max() < 0.001 / 0.5 * 1.01
 
 
+@pytest.mark.parametrize("spacing", [8.0, 20.0, 60.0])
+def test_shares_are_continuous_along_the_way_however_sparse_its_cameras(spacing):
+    seen = road(60 * spacing, spacing)
+    balls = find_balls(seen, 5.0)
+    between = np.linspace(0, len(seen.centers) - 1, 60_001)
+    way = np.stack([np.interp(between, np.arange(len(seen.centers)), x) for x in seen.centers.T], -1)
+    assert len(balls) > 1
+    assert window_shares(torch.from_numpy(way), tuple(balls)).diff(dim=0).abs().max() < 0.05
+
+
+def test_a_window_without_cameras_is_refused_in_one_sentence():
+    with pytest.raises(InputError, match="holds no training camera"):
+        cameras_of(line_of(1e4)[0], road(30).centers)
+
+
 # Plans ---------------------------------------------------------------------------------------------------------------
 
 
@@ -150,6 +167,15 @@ def test_a_windowed_plan_survives_json():
     plan = WindowedPlan(line_of(0.0, 2.5))
     assert WindowedPlan.from_json(plan.to_json()) == plan
     assert plan.names[0].startswith("window 0: ") and plan.plans[0].num_heads == 1
+
+
+@pytest.mark.parametrize("radius", [1.0, None])
+def test_the_only_window_of_a_list_holds_all_cameras(radius):
+    """Of an edited plan, say: its ball, also null, means nothing."""
+    data = json.loads(WindowedPlan(line_of(0.0, 2.5)).to_json())
+    data["windows"] = [data["windows"][0] | {"radius": radius}]
+    plan = WindowedPlan.from_json(json.dumps(data))
+    assert len(cameras_of(plan.windows[0], road(30).centers)) == 30 and WindowedPlan.from_json(plan.to_json()) == plan
 
 
 @pytest.mark.parametrize(
