@@ -99,10 +99,13 @@ class MMPIModel(Model):
         """Scene plan of the option, or of the placement rule for the observations of the training cameras."""
         config, capture = self.config, self.capture
         observations = None if capture is None else capture.observations
-        if observations is not None and config.total_steps == 0:
-            config.total_steps = steps_for(most_pixels(observations, placement), config.size, config.rays_times)
+        given = None
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
-            return WindowedPlan.load(config.plan_file)
+            given = WindowedPlan.load(config.plan_file)
+        if observations is not None and config.total_steps == 0:
+            config.total_steps = steps_for(most_pixels(observations, placement, given), config.size, config.rays_times)
+        if given is not None:
+            return given
         if capture is None or observations is None:
             folder = None if config.windows_folder is None else config.windows_folder.parent / "nerfstudio_models"
             if folder is not None and folder.is_dir():
@@ -116,7 +119,7 @@ class MMPIModel(Model):
         return MMPIField(
             self.progress.windows.plans[0],
             shares_depth=schedule.is_joint,
-            learns_reliability=self.config.schedule.training != "joint",
+            learns_reliability=not schedule.is_joint,
             factor=schedule.texel_factor(0),
             views=views,
             **asdict(self.config.colour),
@@ -126,6 +129,7 @@ class MMPIModel(Model):
     def _take_plan(self, _: Any = None) -> None:
         """Applies plan and schedule, also those of a loaded checkpoint."""
         self.field.shares_depth = self.progress.schedule.is_joint
+        self.field.learns_reliability = not self.field.shares_depth
         self.show.set_options(["all", *self.progress.windows.names])
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:

@@ -85,7 +85,7 @@ class ScheduleConfig:
     finetune_share: float = 0.4
     """Share of the steps in which everything trains together at the end."""
     decay_decades: float = 1.0
-    """Decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5),"""
+    """Decades that learning rates fall over a phase (DVGO: x0.1 per 20k of 30k steps = 1.5),"""
     decay_from: float = 0.5
     """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
@@ -105,7 +105,7 @@ class SamplingConfig:
     threshold: float = 3e-3
     """Weight below which samples get no gradient (at most a tenth of an equal share until surfaces have formed)."""
     cube_alpha: float = 1e-3
-    """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
+    """Initial alpha of a cube sample at full resolution: 1e-2 for a small room to 1e-4."""
 
 
 @dataclass

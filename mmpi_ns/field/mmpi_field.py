@@ -108,6 +108,8 @@ class MMPIField(TexelTables):
         packed = None if cube is None else geometry.Cube.pack(cube, self.samples_per_voxel, device=device)
         interval = 1.0 / self.samples_per_voxel
         bias = math.log(math.expm1(-math.log1p(-self.cube_alpha) / interval))
+        if packed is not None and self.full_plan.cube is not None:  # coarse samples are longer, as in DVGO
+            interval = packed.step / geometry.Cube.pack(self.full_plan.cube, 1.0).step
         # From the current plan: that of a checkpoint has its own K.
         scale = 1.0 / len(self.full_plan.mpis) if self.shares_depth else 1.0
         depths = (biases, scale, packed, bias, interval)

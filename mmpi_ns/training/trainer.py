@@ -65,11 +65,11 @@ class MMPITrainer(Trainer):
                 torch.cuda.set_device(self.local_rank)
             self.turns = FrameTurns(lambda: self.training_state == "training")
             self._stopped_by: int | None = None
-            self._compared = False
             self._log: TrainingLog | None = None
             self._began = monotonic()
             config = self.config
             model_config: Any = config.pipeline.model
+            self._compared = model_config.ops == "torch"
             model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
             model_config.total_steps = config.max_num_iterations
             self._follows_capture = config.max_num_iterations == 0
@@ -312,6 +312,9 @@ class MMPITrainer(Trainer):
         self.config.load_dir, self.config.load_checkpoint = asked, asked_for
         if path is not None:
             progress = run.progress
+            for kind, scheduler in self.optimizers.schedulers.items():
+                if not self.config.optimizers[kind]["scheduler"]:  # at this step also with --load-scheduler False
+                    scheduler.last_epoch = self._start_step
             run.field.views = views_of(progress.windows.windows[progress.window], run.views)
             finished = progress.schedule.window_at(self._start_step)
             run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished)

@@ -81,7 +81,7 @@ def test_growing_keeps_the_parameters_and_a_bilinear_field():
             values = scale * (across + 2 * x - 3 * y + (x * y if grid is not field.grids[-1] else 0))
             getattr(field, name).data[grid.rows] = torch.tensor(values.reshape(-1, 1), dtype=torch.float32)
     rays = bundle(*random_rays(plan, 40, seed=1))
-    coarse = render(field.eval(), rays)
+    coarse, layout = render(field.eval(), rays), field.layout
     field.grow(1.0)
     assert [getattr(field, name) for name in TABLES] == before and all(a is b for a, b in zip(
         before, (field.density, field.features, field.reliability), strict=True))  # fmt: skip
@@ -91,6 +91,8 @@ def test_growing_keeps_the_parameters_and_a_bilinear_field():
     fine = render(field, rays)
     assert (coarse.samples.num_intersected > 3).any()
     mpi_only = (coarse.samples.heads < 2).all(1)  # the cube's samples lie closer when it grows
+    (long, thick), (short, thin) = ((x.cube.step, x.cube_interval) for x in (layout, field.layout))
+    assert thin == 1 and long > 1.2 * short and thick == pytest.approx(long / short), "and are thinner"
     assert mpi_only.sum() > 5
     assert torch.allclose(coarse.composite.transmittance[mpi_only], fine.composite.transmittance[mpi_only], atol=1e-5)
     assert torch.allclose(coarse.rgb[mpi_only], fine.rgb[mpi_only], atol=1e-5)

@@ -118,6 +118,17 @@ def test_checkpoints_load_as_plain_data_and_hold_plan_schedule_and_resolution(wh
     assert (whole[1].parent / "plan.json").is_file()
 
 
+@pytest.mark.parametrize(("whole", "step"), [("split", 14)], indirect=["whole"])
+@pytest.mark.parametrize(("loads", "training"), [(False, "two-phase"), (True, "joint")])
+def test_rates_and_reliability_follow_the_checkpoint(whole, scene, plan_file, tmp_path, step, loads, training):
+    config = trainer_config(scene, plan_file, tmp_path, STEPS, **whole[0])
+    config.load_scheduler, config.pipeline.model.schedule.training = loads, training
+    trainer = ready(config, load_dir=whole[1], load_step=step)
+    trainer.train()
+    states = (load(folder, STEPS - 2) for folder in (whole[1], trainer.checkpoint_dir))
+    assert differences(*({k: state[k] for k in ("pipeline", "optimizers")} for state in states)) == []
+
+
 # Interruptions -------------------------------------------------------------------------------------------------------
 
 
