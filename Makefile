@@ -89,7 +89,7 @@ gallery: venv ## Train four procedural scenes and write docs/gallery.md with the
 
 results: venv ## Make every number of README.md and docs/results (hours; what is finished is kept): DATA=captures/
 	$(BIN)/python benchmarks/accuracy.py
-	$(BIN)/python benchmarks/results.py --data $(DATA) $(ARGS)
+	$(BIN)/python benchmarks/results.py --data $(DATA) --threads 1 $(ARGS)
 
 clean: ## Remove build products and caches (not .venv)
 	rm -rf build dist site *.egg-info .pytest_cache .ruff_cache

@@ -19,6 +19,7 @@ from statistics import median
 from typing import Any
 
 import tyro
+from apart import environment_of
 from ordinary_captures import MATRIX, STEP, Capture, write_capture
 from report import commit
 
@@ -46,7 +47,7 @@ class Matrix:
         rows: dict[str, Any] = json.loads(done.read_text()) if done.is_file() else {}
         for capture in sorted(MATRIX, key=lambda capture: capture.megapixels):
             if capture.name not in rows and capture.megapixels <= self.most:
-                rows[capture.name] = run_capture(capture, self.folder / "capture") | {"commit": commit()}
+                rows[capture.name] = run_capture(capture, self.folder.resolve() / "capture") | {"commit": commit()}
                 print(capture.name, json.dumps(rows[capture.name]), flush=True)
                 done.write_text(json.dumps(rows))
         self.output.write_text(report(rows), encoding="utf-8")
@@ -97,7 +98,7 @@ def run_capture(capture: Capture, folder: Path) -> dict[str, Any]:
 
 def run_command(command: list[str], folder: Path) -> dict[str, Any]:
     """How a command ends: "well", its sentence, or "TRACEBACK" with the last line."""
-    environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache"), "COLUMNS": "1000"}
+    environment = environment_of(1) | {"XDG_CACHE_HOME": str(folder / "cache"), "COLUMNS": "1000"}
     program = Path(sys.executable).with_name(command[0])
     with open(folder / "errors", "w+") as errors:
         process = subprocess.Popen(

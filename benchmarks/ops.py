@@ -127,7 +127,7 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
     lookup = field._lookup(bundle, samples)
     (num_rays, slots), intersected, kept = lookup.shape, float(samples.num_intersected.sum()), float(len(lookup.index))
     channels, rows, taps = field.feature_channels, float(len(lookup.rows)), lookup.taps[0]
-    counts = {"rays": num_rays, "intersected": intersected, "kept": kept, "rows": rows, "pixels": len(batch["image"])}
+    counts = {"rays": num_rays, "intersected": intersected, "kept": kept, "rows": rows, "pixels": len(batch["indices"])}
     kept_bytes = 2 * 4 + 3 * 4 + 3 * 4 + 1  # head and plane, position, distance and depths, whether valid
     ops = [
         Op("march: look up, merge, keep", sample, intersected * 4 * 4 + kept * kept_bytes),

@@ -39,7 +39,7 @@ class Demo:
     steps: int = 1000
     """Training steps."""
     images: int = 64
-    """Images of the scene; half of them are held out for testing."""
+    """Images of the scene; half of them are held out for testing, of room and object an eighth."""
     frames: int = 40
     """Frames of the fly-through."""
     kind: Literal["street", "long-road", "room", "object"] = "street"
@@ -190,10 +190,11 @@ class Demo:
             )  # fmt: skip
 
     def _say_where(self, results: dict[str, Any], film: Path, seconds: float) -> None:
+        held_out = json.loads((self.scene / "transforms.json").read_text(encoding="utf-8"))["test_filenames"]
         film_note = "the fly-through" if film.suffix else "the fly-through as frames (no encoder was found)"
         print(
             f"\nDone in {seconds // 60:.0f} min {seconds % 60:.0f} s. PSNR {results['psnr']:.2f} dB, "
-            f"SSIM {results['ssim']:.3f} over {self.images // 2} images held out.\n\nOpen first:\n"
+            f"SSIM {results['ssim']:.3f} over {len(held_out)} images held out.\n\nOpen first:\n"
             f"  {self.folder / 'contact-sheet.png'}   what each MPI does\n"
             f"  {self.page}   the {self.kind} in a browser: open it by a double click, drag and press W\n"
             f"  {film}   {film_note}\n"

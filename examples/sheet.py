@@ -145,7 +145,7 @@ def _whole_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
     return [
         (_label("Ground truth", "test images, not used for training", size), [image_of(s.truth, VIEW) for s in shown]),
         (
-            _label("Rendering", f"all MPIs merged by distance\nPSNR {scores} dB", size),
+            _label("Rendering", f"all MPIs merged by distance, with details\nPSNR {scores} dB", size),
             [image_of(v.color, VIEW) for v in views],
         ),
         (

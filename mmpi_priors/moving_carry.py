@@ -91,7 +91,7 @@ def whole_objects(is_moving: Mask, ground: Map, masked: Mask) -> Mask:
     """Large objects, not masked yet, with scattered moving pixels (paint has no texture). [h, w]
 
     Args:
-        moves: pixels that move. [h, w]
+        is_moving: pixels that move. [h, w]
         ground: inverse depth of the ground, 0 near the horizon and above. [h, w]
         masked: moving objects so far. [h, w]
     """

@@ -42,3 +42,5 @@ def test_tables_are_those_that_were_measured(page, make):
     text = (ROOT / page).read_text(encoding="utf-8")
     (table,) = re.findall(r"<!-- results -->\n\n(.*?)\n\n<!-- /results -->", text, re.DOTALL)
     assert table == make(content, scored)
+    made = content["made"]["command"].replace("python", "$(BIN)/python").replace("captures", "$(DATA)")
+    assert f"\t{made} $(ARGS)\n" in (ROOT / "Makefile").read_text(encoding="utf-8")
