@@ -83,8 +83,8 @@ def tiles_with_copies(
 ) -> tuple[Bool[Tensor, "S"], Bool[Tensor, "T"]]:
     """Tiles stored by finer copies of MPIs for chosen ones, and tiles that the MPIs continue to store.
 
-    A chosen tile has FINER x FINER tiles in the copy. The MPI drops it if all stored tiles around it are chosen too, so
-    copy and MPI overlap by a tile without a visible seam.
+    A chosen tile has FINER x FINER tiles in the copy. The MPI drops it if all stored tiles around it are chosen too: in
+    others both count, and training adapts them.
 
     ``grids`` are all heads, MPIs first; the tiles of ``copies`` are not read. Returns tiles of the copies, and of all
     heads.
