@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
-from torch import Tensor
+from torch import Tensor, tensor
 from viser import CameraHandle, ClientHandle, ViserServer
 
 from mmpi_ns.training.frames import FrameThread
+from mmpi_ns.utils.files import natural_key
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
@@ -110,7 +111,9 @@ class PathControls(ViewerElement[float], ViewerControl):
     def _setup(self, viewer: Viewer) -> None:
         """Receives the viewer, once all controls exist."""
         super()._setup(viewer)
-        cameras: Cameras = viewer.pipeline.datamanager.train_dataset.cameras  # type: ignore[union-attr]
+        dataset: Any = viewer.pipeline.datamanager.train_dataset
+        names = [str(name) for name in dataset.image_filenames]  # nerfstudio has 10 before 9
+        cameras: Cameras = dataset.cameras[tensor(sorted(range(len(names)), key=lambda i: natural_key(names[i])))]
         path = CapturedPath(cameras.camera_to_worlds.cpu().numpy())
         i = path.start
         self._half_width = float(cameras.cx[i] / cameras.fx[i])

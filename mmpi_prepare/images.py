@@ -17,7 +17,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from mmpi_ns.data.exif import kept_tags, positive_number, tags_of
 from mmpi_ns.utils.errors import InputError, log, progress
-from mmpi_ns.utils.files import opened, whole
+from mmpi_ns.utils.files import natural_key, opened, whole
 from mmpi_prepare.gps import Place, place_of
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -95,11 +95,6 @@ def find_images(folder: Path) -> list[Path]:
 def in_short(names: Sequence[str], most: int = 4) -> str:
     """The first names, and the number of the others."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def natural_key(text: str) -> list[tuple[int, int | str]]:
-    """Sort key by which 9 comes before 10."""
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part]
 
 
 def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:

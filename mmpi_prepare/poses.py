@@ -16,8 +16,9 @@ import pycolmap
 
 from mmpi_ns.data.checks import MAP_COORDINATES
 from mmpi_ns.utils.errors import InputError, log
+from mmpi_ns.utils.files import natural_key
 from mmpi_prepare.adjustment import Array, camera_poses, nearest_rotation
-from mmpi_prepare.images import IMAGES, Photo, natural_key
+from mmpi_prepare.images import IMAGES, Photo
 from mmpi_priors.conventions import Matches, find_convention, in_words
 
 Lens = Literal["auto", "pinhole", "radial", "opencv", "fisheye"]

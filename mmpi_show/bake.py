@@ -20,6 +20,7 @@ from mmpi_ns.functional import read_run_config
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.rendering.metrics import ImageMetrics, psnr
 from mmpi_ns.scene.windows import window_shares
+from mmpi_ns.utils.files import natural_key
 from mmpi_ns.utils.parallel import in_order, torch_apart
 from mmpi_show.codes import smoothed_codes
 from mmpi_show.details import stored_view
@@ -87,7 +88,7 @@ def bake_run(pipeline: Any, least: float) -> BakedScene:
             focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
             size = (int(camera.width), int(camera.height))
             poses[str(image)] = Pose(camera.camera_to_worlds.tolist(), size, focal, center, test)
-    path = [poses[image] for image in sorted(poses)]
+    path = [poses[image] for image in sorted(poses, key=natural_key)]
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
     name = Path(pipeline.datamanager.get_datapath()).resolve().name
     return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows, views, nearest)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,6 +21,11 @@ Arrays = Mapping[str, NDArray[np.generic]]
 Pairs = Iterable[tuple[str, NDArray[np.generic]]]
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
 UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
+
+
+def natural_key(text: str) -> list[tuple[int, int | str]]:
+    """Sort key by which 9 comes before 10."""
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part]
 
 
 @contextmanager

@@ -9,11 +9,14 @@ from contextlib import contextmanager
 from itertools import cycle
 from threading import Thread
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import torch
 from browser import CHROMIUM, browser
 from forked import start, start_train, train
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMachine
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from numpy.testing import assert_allclose
@@ -23,7 +26,7 @@ from training_runs import write_plan
 
 from mmpi_ns.training import frames
 from mmpi_ns.training.frames import PATIENCE, SHARE, FrameThread, FrameTurns
-from mmpi_ns.viewer import CapturedPath, fitting_fov
+from mmpi_ns.viewer import CapturedPath, PathControls, fitting_fov
 
 
 def street(count=13):
@@ -50,6 +53,17 @@ def test_a_path_of_one_camera_is_that_camera():
     path = CapturedPath(street(1))
     assert path.start == 0
     assert_allclose(path.at(0).position, 0, atol=1e-12)
+
+
+def test_the_path_goes_by_the_numbers_in_the_names_of_images():
+    order, viewer, controls = [0, 9, 10, 1, 2, 3, 4, 5, 6, 7, 8], MagicMock(), PathControls()  # nerfstudio's
+    dataset = viewer.pipeline.datamanager.train_dataset
+    dataset.image_filenames = [f"{i + 1}.jpg" for i in order]
+    dataset.cameras = Cameras(torch.tensor(street(11), dtype=torch.float32)[order], 100.0, 100.0, 50.0, 40.0, 100, 80)
+    viewer.pipeline.model.progress.windows.plans[0].content_near = 1.0
+    controls._slider = SimpleNamespace(value=0.0)
+    controls._setup(viewer)
+    assert_allclose(controls._path.positions[:, 0], -np.arange(11))
 
 
 def test_one_rolled_camera_leaves_the_horizon_level():
