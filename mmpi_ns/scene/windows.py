@@ -102,7 +102,7 @@ class WindowedPlan:
             except InputError as error:
                 raise InputError(f"Window {i} of the plan: {error}") from error
             windows.append(Window(center, row["radius"], row["margin"], plan))
-        return WindowedPlan.single(plan) if len(windows) == 1 else WindowedPlan(tuple(windows))
+        return WindowedPlan.single(windows[0].plan) if len(windows) == 1 else WindowedPlan(tuple(windows))
 
     @staticmethod
     def load(path: Path) -> WindowedPlan:
