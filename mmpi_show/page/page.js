@@ -70,7 +70,9 @@ class Page {
   // Draws a window from the first part of its file on; the rest follows.
   async load(w, row) {
     const told = (part) => {
-      if (!failed()) report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
+      if (failed()) return;
+      if (part < 1) report(`Loading ${this.header.name} … ${Math.round(100 * part)} %`);
+      else this.describe();
     };
     const parts = partsOf(row, told), [first, rest, views] = Array.from({ length: 3 }, async () => (await parts.next()).value);
     for (const later of [rest, views]) later.catch(() => {}); // awaited only once the first part is drawn
@@ -157,7 +159,8 @@ class Page {
 
   turn(dx, dy) { // pixels of the screen: to where one drags, as in nerfstudio's viewer
     this.playing = null;
-    const angle = -this.camera.size[0] / this.camera.focal[0] / innerWidth, up = this.header.up;
+    const { size, focal } = this.camera, { up } = this.header;
+    const angle = -1 / (focal[0] * Math.max(innerWidth / size[0], innerHeight / size[1]));
     let axes = this.camera.axes.map((axis) => rotated(axis, up, dx * angle));
     const tilted = axes.map((axis) => rotated(axis, axes[0], dy * angle));
     if (Math.abs(dot(tilted[2], up)) < 0.98) axes = tilted;

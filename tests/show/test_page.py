@@ -122,6 +122,11 @@ def test_controls_move_the_camera(opened):
     until(lambda: 0.5 < axes(opened)[2] @ aside[2] < 0.9999)
     # One looks to where one drags, as in nerfstudio's viewer.
     assert np.cross(back, aside[2]) @ opened.evaluate("mmpi.header.up") < 0 < axes(opened)[2] @ aside[1]
+    before_turn, width = axes(opened)[2], opened.evaluate("innerWidth")
+    opened.evaluate("(window.innerWidth = innerHeight / 4, mmpi.turn(9, 0))")  # a narrow window, which the height fills
+    pixel = opened.evaluate("mmpi.camera.focal[0] * innerHeight / mmpi.camera.size[1]")
+    assert np.arccos(axes(opened)[2] @ before_turn) == pytest.approx(9 / pixel, rel=0.1)
+    opened.evaluate(f"window.innerWidth = {width}")
     opened.evaluate("mmpi.press('p')")
     opened.until("mmpi.playing === null")
     assert np.allclose(eye(opened), opened.evaluate("mmpi.path[1].eye"))
