@@ -73,12 +73,12 @@ def transforms(
     kinds = {is_fisheye for _, is_fisheye in lenses.values()}
     if len(kinds) > 1:
         raise InputError("Fisheye and perspective lenses in one scene: prepare them separately.")
-    keys = ("k1", "k2", "k3", "k4") if True in kinds else ("k1", "k2", "p1", "p2")
+    keys = ("k1", "k2", "k3", "k4") if True in kinds else ("k1", "k2", "p1", "p2", "k3")
     entries: dict[int, dict[str, Any]] = {}
     for number, (values, _) in lenses.items():
         size = {"w": model.cameras[number].width, "h": model.cameras[number].height}
         entry = dict(zip(("fl_x", "fl_y", "cx", "cy"), values[:4], strict=True)) | size
-        entries[number] = entry | dict(zip(keys, values[4:], strict=True))
+        entries[number] = entry | dict(zip(keys, values[4:], strict=False))
     is_shared = len({tuple(entry.values()) for entry in entries.values()}) == 1
     camera_of = {image.name: image.camera_id for image in model.images.values()}
     frames = []

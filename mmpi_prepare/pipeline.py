@@ -71,7 +71,7 @@ class Preparation:
         log(f"Matching: {self.matching}.")
         names = [p.name for p in self.photos]
         self.is_ordered = self.is_video or features.are_in_order(folder / features.DATABASE, names)
-        source = [s.poses_axes, s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
+        source = [s.poses_axes, s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed, s.camera is None]
         folder, self.mapped = self._stage("model", source, partial(self._map, folder / features.DATABASE))
         model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
         count, total = model.num_reg_images(), len(self.photos)
@@ -167,6 +167,8 @@ class Preparation:
         is_given = bool(lenses) or s.focal is not None
         if self.given_poses is not None and not is_given and not all(p.exif_focal for p in self.photos):
             raise InputError("Known poses need the intrinsics they were made with: give --focal or --camera.")
+        if s.refine_intrinsics and any(c.model.name == "FULL_OPENCV" for c in self.cameras):
+            raise InputError(f"--refine-intrinsics refines no lens with a k3, as in {s.poses}: leave one of them out.")
         self.is_fixed = (is_given or self.given_poses is not None) and not s.refine_intrinsics
 
     def _match(self, unmatched: Path, folder: Path) -> str:

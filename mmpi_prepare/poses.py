@@ -35,10 +35,11 @@ KIND = re.compile(r"[._-]?(pose|color|rgb|image|depth)s?$", re.IGNORECASE)
 
 
 def opencv_camera(values: Sequence[float], fisheye: bool) -> pycolmap.Camera:
-    """A camera of no size by fx, fy, cx, cy and the terms of its lens, k1, k2, p1, p2 or k1 to k4 of a fisheye; a
+    """A camera of no size by fx, fy, cx, cy and the terms of its lens, k1, k2, p1, p2, k3 or k1 to k4 of a fisheye; a
     pinhole where there are none."""
-    model = "OPENCV_FISHEYE" if fisheye else "OPENCV" if any(values[4:]) else "PINHOLE"
-    return pycolmap.Camera(model=model, params=[*values, 0.0, 0.0, 0.0, 0.0][: 4 if model == "PINHOLE" else 8])
+    bent = "FULL_OPENCV" if any(values[8:]) else "OPENCV" if any(values[4:]) else "PINHOLE"
+    model, sizes = "OPENCV_FISHEYE" if fisheye else bent, {"PINHOLE": 4, "FULL_OPENCV": 12}
+    return pycolmap.Camera(model=model, params=[*values, *[0.0] * 8][: sizes.get(model, 8)])
 
 
 def make_cameras(
@@ -78,13 +79,13 @@ def make_cameras(
 
 
 def opencv_intrinsics(camera: pycolmap.Camera) -> tuple[list[float], bool]:
-    """The numbers of ``opencv_camera``, eight of them, and whether it is a fisheye. Raises InputError if
+    """The numbers of ``opencv_camera``, nine of them, and whether it is a fisheye. Raises InputError if
     nerfstudio-data does not support the lens model."""
     name, terms = camera.model.name, [float(v) for v in camera.params[camera.extra_params_idxs()]]
-    if name not in (*MODELS.values(), "SIMPLE_PINHOLE", "RADIAL"):
+    if name not in (*MODELS.values(), "SIMPLE_PINHOLE", "RADIAL", "FULL_OPENCV") or any(terms[5:]):
         raise InputError(f"Lens model {name} is not supported in transforms.json.")
     f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    return [*f, *terms, 0.0, 0.0, 0.0, 0.0][:8], name == "OPENCV_FISHEYE"
+    return [*f, *terms, *[0.0] * 5][:9], name == "OPENCV_FISHEYE"
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> GivenPoses:
     if is_transforms or not path.is_dir():
         read = (_read_transforms if is_transforms else _read_lines)(path, photos)
     else:  # one text file for each image, by name, else in order
-        files = [p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")]
+        files = [p for p in path.glob("[!.]*") if p.suffix.lower() in (".txt", ".mat", "")]
         files.sort(key=lambda p: natural_key(p.name))
         by_stem = {KIND.sub("", p.stem): p for p in files if p.is_file()}
         chosen = {p.name: by_stem[stem] for p in photos if (stem := KIND.sub("", Path(p.source).stem)) in by_stem}
@@ -189,7 +190,8 @@ def _read_lines(path: Path, photos: Sequence[Photo]) -> GivenPoses:
     """Poses in the lines of a text file, in which # begins a comment.
 
     KITTI: 12 numbers, a line for each image; of more lines, the numbers in the file names choose (counted from 0). TUM:
-    8 numbers, by time stamp if the file names are time stamps, else a line for each image.
+    8 numbers, by time stamp if the file names are time stamps, else a line for each image. Whole numbers in names are
+    time stamps if those of the file are whole, too, unless there is a line for each image and some have none.
     """
     numbers = _read_numbers(path)
     rows, width = numbers.shape
@@ -211,13 +213,15 @@ def _read_lines(path: Path, photos: Sequence[Photo]) -> GivenPoses:
         pose[:3, :3] = pycolmap.Rotation3d(row[4:8]).matrix() if np.linalg.norm(row[4:8]) > 0 else np.nan
         pose[:3, 3] = row[1:4]
     matched: dict[str, Array] = {}
+    are_whole = not (numbers[:, 0] % 1).any()
+    pattern = r"\d+\.\d+" + are_whole * r"|\d+"
     for photo in photos:
         source = Path(photo.source)
-        stamps = re.findall(r"\d+\.\d+|\d+", source.stem if source.suffix.lower() in IMAGES else photo.source)
+        stamps = re.findall(pattern, source.stem if source.suffix.lower() in IMAGES else photo.source)
         lags = np.abs(numbers[:, 0] - float(stamps[-1])) if stamps else np.full(1, np.inf)
         if lags.min() <= MAX_LAG:
             matched[photo.name] = poses[lags.argmin()]
-    if 2 * len(matched) >= len(photos):
+    if 2 * len(matched) >= len(photos) and not (are_whole and len(matched) < len(photos) == rows):
         return GivenPoses(matched, f"TUM poses, matched by time stamp within {MAX_LAG} s")
     if rows != len(photos):
         raise InputError(
@@ -244,11 +248,13 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> GivenPoses:
         _check_apart(places, path)
         poses, intrinsics = {}, {}
         for photo in (p for p in photos if p.name in places):
-            frame = meta | frames[places[photo.name]]
+            frame = frames[places[photo.name]] | meta  # as in nerfstudio, a value for all overrides that of a frame
             poses[photo.name] = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
             if "fl_x" in frame:  # for images that may be smaller or larger than those of the file
                 fisheye = frame.get("camera_model") in FISHEYE
-                keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+                keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+                if not fisheye and frame.get("k4"):
+                    raise InputError(f"{path} gives {photo.name} a k4, which OpenCV's perspective lens lacks.")
                 sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)
                 if abs(sx / sy - 1) > 0.02:
                     raise InputError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")

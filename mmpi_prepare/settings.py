@@ -44,7 +44,8 @@ class Settings:
     camera: tuple[float, ...] | None = None
     """f cx cy | fx fy cx cy | fx fy cx cy k1 k2 p1 p2 in pixels of the input; kept fixed unless --refine-intrinsics."""
     lens: Lens = "auto"
-    """Distortion if --camera gives none. auto: none with --focal; else one radial term, or OpenCV's four if better."""
+    """Distortion to fit, with --focal only by --refine-intrinsics; --camera has its own (k1 to k4 with fisheye). auto:
+    none with --focal; else one radial term, or OpenCV's four if better."""
     intrinsics: Sharing = "auto"
     """auto: images with the same size, EXIF body and lens share a camera."""
     refine_intrinsics: bool = False
@@ -91,10 +92,13 @@ def check(s: Settings) -> None:
     kinds = " or ".join(GIVEN_COUNTS.values())
     camera = (1.0,) * 4 if s.camera is None else s.camera
     focals = camera[: 1 if len(camera) == 3 else 2]
+    is_kept = s.camera is not None or (s.focal is not None and not s.refine_intrinsics)
     faults = {
         f"--camera takes {kinds}, not {len(camera)} numbers.": len(camera) not in GIVEN_COUNTS,
         "--camera: focal lengths must be positive, in pixels.": min(focals, default=1) <= 0,
         "--focal and --camera both give a focal length: leave one out.": None not in (s.focal, s.camera),
+        f"--lens {s.lens} is not fitted to a given camera: give --camera with its terms, or --focal and "
+        "--refine-intrinsics.": is_kept and s.lens in ("radial", "opencv") and len(camera) < 8,
         f"--test-every takes 2 or more, not {s.test_every}; or 0: all images train and test.": (s.test_every or 2) < 2,
         f"--downscales takes different numbers, not {s.downscales}.": len(set(s.downscales)) < len(s.downscales),
         f"--threads takes a number of threads, or -1 for all cores, not {s.threads}.": s.threads < 1

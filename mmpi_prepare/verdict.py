@@ -56,7 +56,7 @@ class Verdict:
 def remedy(cameras: int, is_sequence: bool, is_given: bool) -> str:
     """Remedies for a capture of so many cameras, with or without given intrinsics."""
     ways = [] if is_sequence else ["add images that overlap more"]
-    ways += ["give --focal (and --lens) if you know them"] if cameras == 1 and not is_given else []
+    ways += ["give --focal, or --camera with its lens, if you know them"] if cameras == 1 and not is_given else []
     ways += ["try --lens radial, as each lens is known from few images"] if cameras > 1 and not is_given else []
     ways += ["mask what moves (--masks)"]
     ways += ["prepare the frames before and after apart"] if is_sequence else []

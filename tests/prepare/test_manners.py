@@ -34,6 +34,8 @@ def frames(tmp_path):
     [
         ({"focal": NAN}, "--focal"), ({"focal": -3.0}, "--focal"), ({"camera_height": 0.0}, "--camera-height"),
         ({"camera": (NAN, 1.0, 1.0)}, "--camera"), ({"camera": (9.0, 1.0, 1.0), "focal": 9.0}, "leave one out"),
+        ({"focal": 9.0, "lens": "radial"}, "--lens radial"),
+        ({"camera": (9.0, 1.0, 1.0), "lens": "opencv", "refine_intrinsics": True}, "--lens opencv"),
         ({"test_every": 1}, "--test-every"), ({"test_every": -4}, "--test-every"),
         ({"downscales": (2, 0)}, "--downscales"),
         ({"downscales": (2, 2)}, "--downscales"), ({"refine_poses": True}, "--poses"), ({"overlap": 0}, "--overlap"),

@@ -139,6 +139,7 @@ SIZE = {"width": 200, "height": 160, "camera_id": 1}
         ("SIMPLE_RADIAL", [150, 98, 83, 0.1]),
         ("RADIAL", [150, 98, 83, 0.1, -0.05]),
         ("OPENCV", [150, 140, 98, 83, 0.1, -0.05, 0.02, -0.01]),
+        ("FULL_OPENCV", [150, 140, 98, 83, 0.1, -0.05, 0.02, -0.01, 0.3, 0, 0, 0]),
         ("OPENCV_FISHEYE", [150, 140, 98, 83, 0.1, -0.05, 0.02, -0.01]),
     ],
 )
@@ -148,7 +149,7 @@ def test_a_lens_of_colmap_projects_as_opencv_says(model, params):
     rays = np.array([[0.3, -0.2, 1.0], [-0.4, 0.35, 1.0], [0.1, 0.4, 1.0]])
     matrix, still = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
     project = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
-    args = (still, still, matrix, np.array(terms))
+    args = (still, still, matrix, np.array(terms[: 4 if is_fisheye else 5]))
     wanted = (project(rays[None], *args) if is_fisheye else project(rays, *args))[0].reshape(-1, 2)
     assert camera.img_from_cam(rays) == pytest.approx(wanted, abs=1e-6)
 
@@ -160,7 +161,7 @@ def test_given_lenses_are_kept_apart_and_come_back_from_colmaps():
     numbers, cameras = make_cameras(photos, "auto", given, 120.0, "auto")
     assert numbers == [1, 2, 1, 3] and [c.camera_id for c in cameras] == [1, 2, 3]
     assert [c.model.name for c in cameras[:2]] == ["OPENCV_FISHEYE", "PINHOLE"]
-    assert [opencv_intrinsics(c) for c in cameras[:2]] == [(bent, True), ([*flat, 0.0, 0.0, 0.0, 0.0], False)]
+    assert [opencv_intrinsics(c) for c in cameras[:2]] == [([*bent, 0.0], True), ([*flat, *[0.0] * 5], False)]
 
 
 # Files ---------------------------------------------------------------------------------------------------------------

@@ -81,16 +81,25 @@ def test_tum_poses_are_matched_by_time_stamp(tmp_path):
     assert read(path, photos=photos)[1] == pytest.approx(GIVEN[[5, 2]], abs=1e-9)
 
 
+def test_frame_numbers_are_no_seconds(tmp_path):
+    for times in (np.arange(COUNT), np.arange(COUNT) + 1, np.arange(COUNT) * 0.5):  # of frames 1 to COUNT
+        assert read(write_tum(tmp_path / "poses.txt", GIVEN, times))[1] == pytest.approx(GIVEN, abs=1e-9)
+    path = write_tum(tmp_path / "poses.txt", GIVEN, np.arange(COUNT) + 1)
+    assert read(path, photos=[PHOTOS[5], PHOTOS[2]])[1] == pytest.approx(GIVEN[[5, 2]], abs=1e-9)
+    with pytest.raises(InputError, match="not their time stamps"):
+        read(write_tum(tmp_path / "poses.txt", GIVEN, np.arange(COUNT) * 0.5), photos=PHOTOS[:3])
+
+
 def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_path):
     lists = {"train_filenames": ["images/frame_001.png"], "test_filenames": ["images/frame_002.png"]}
     lens = {"fl_y": 350.0, "cx": 236.0, "cy": 162.0, "k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5}
     path = tmp_path / "transforms.json"
     known, _ = read(write_transforms(path, GIVEN, **lens, **lists))  # of images twice as large
     wanted = [170.0, 175.0, 118.0, 81.0, 0.1, 0.2]
-    assert opencv_intrinsics(known.intrinsics["frame_001.png"]) == ([*wanted, 0.3, 0.4], False)
+    assert opencv_intrinsics(known.intrinsics["frame_001.png"]) == ([*wanted, 0.3, 0.4, 0.5], False)
     assert known.split is not None and known.split["test_filenames"] == lists["test_filenames"]
     known, _ = read(write_transforms(path, GIVEN, **lens, k4=0.6, camera_model="OPENCV_FISHEYE"))
-    assert opencv_intrinsics(known.intrinsics["frame_008.png"]) == ([*wanted, 0.5, 0.6], True)
+    assert opencv_intrinsics(known.intrinsics["frame_008.png"]) == ([*wanted, 0.5, 0.6, 0.0], True)
     assert known.split is None
     renamed = [replace(p, name=f"left-{p.name}", source=f"left/{p.name}") for p in PHOTOS]
     lists = {key: [f"elsewhere/frame_00{n}.png"] for n, key in enumerate(lists, 1)}
@@ -98,6 +107,11 @@ def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_pa
     assert known.split == {"train_filenames": ["left-frame_001.png"], "test_filenames": ["left-frame_002.png"]}
     with pytest.raises(InputError, match=r"^frame_001\.png is 240x160"):
         read(write_transforms(path, GIVEN, w=400))
+    with pytest.raises(InputError, match="a k4, which"):
+        read(write_transforms(path, GIVEN, k4=0.6))
+    meta = json.loads(write_transforms(path, GIVEN).read_text())
+    path.write_text(json.dumps(meta | {"frames": [f | {"fl_x": 999.0} for f in meta["frames"]]}))
+    assert read(path)[0].intrinsics["frame_001.png"].params[0] == 170.0  # nerfstudio reads the one for all
 
 
 @pytest.mark.parametrize(
