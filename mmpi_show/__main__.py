@@ -47,8 +47,9 @@ class _Run:
         if not any(folder.glob("step-*.ckpt")):
             raise ValueError(f"The run has no checkpoint in {folder}: train it at least until its first checkpoint.")
         if is_file:
-            if output.exists() and not self.overwrite:
-                raise ValueError(f"{output} is there already: name another file, or give --overwrite.")
+            windows = output.parent.glob(f"{output.stem}-[0-9][0-9][0-9][0-9][0-9]{output.suffix}")
+            if not self.overwrite and (there := [path for path in (output, *windows) if path.exists()]):
+                raise ValueError(f"{there[0]} is there already: name another file, or give --overwrite.")
         elif output.exists() and not output.is_dir():
             raise ValueError(f"{output} is a file: name a folder to write.")
         elif (output / "scene.json").is_file():

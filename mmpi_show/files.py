@@ -105,6 +105,7 @@ class BakedScene:
         if not self.views:
             return outputs
         exposure = outputs["rgb"].new_tensor(self.windows[0][1].exposure)
+        outputs["radiance"] = outputs["rgb"] / exposure
         return self.details.added(outputs, bundle, self.nearest, exposure)
 
     def render(self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> dict[str, Tensor]:

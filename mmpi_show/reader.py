@@ -1,6 +1,6 @@
 """A reader of baked scenes in plain NumPy: the format and its rendering (docs/export.md) in two hundred lines.
 
-    python mmpi_show/reader.py FOLDER NUMBER image.npy      # renders camera NUMBER of the path
+    python mmpi_show/reader.py FOLDER NUMBER image.npy      # camera NUMBER of the path: the field of the first window
 
 Float64, every plane of every MPI, without other code of this package: an example for other viewers, the reference of
 the tests, and the form that runs where there is no compiler.

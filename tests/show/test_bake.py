@@ -167,6 +167,7 @@ def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
             "one.html is there already",
         ),
         (["splats", "--load-config", "run2/config.yml", "--output", "file"], "file is there already"),
+        (["splats", "--load-config", "run2/config.yml", "--output", "a.ply"], "a-00001.ply is there already"),
     ],
 )
 def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch, capsys):
@@ -174,7 +175,7 @@ def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch, caps
     for folder in ("run", "run2/nerfstudio_models", "used", "home", "export"):
         Path(folder).mkdir(parents=True)
     files = ("run/config.yml", "run2/config.yml", "used/notes.txt", "export/scene.json", "file", "one.html")
-    for name in (*files, "home/index.html", "run2/nerfstudio_models/step-000000001.ckpt"):
+    for name in (*files, "a-00001.ply", "home/index.html", "run2/nerfstudio_models/step-000000001.ckpt"):
         Path(name).write_text("{}")
     monkeypatch.setattr(sys, "argv", ["mmpi-export", *arguments])
     with pytest.raises(SystemExit) as caught:

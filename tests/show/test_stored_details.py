@@ -64,6 +64,16 @@ def test_what_is_written_is_read_and_shown(tmp_path):
     assert "field_rgb" not in replace(scene, views=()).image(bundle)
 
 
+def test_details_are_of_the_radiance(tmp_path):
+    """An exposure multiplies what is rendered and the details alike."""
+    window = opaque_window()
+    scenes = [with_details(scene_of(w), tmp_path) for w in (window, replace(window, exposure=(0.6, 0.8, 0.5)))]
+    plain, exposed = (scene.image(bundle_of(scene.path[0])) for scene in scenes)
+    free = (plain["accumulation"] == 1) & (plain["rgb"] > 0) & (plain["rgb"] < 1)
+    expected = plain["rgb"] * torch.tensor([0.6, 0.8, 0.5])
+    assert free.float().mean() > 0.3 and torch.allclose(exposed["rgb"][free], expected[free], atol=1e-5)
+
+
 def test_a_window_holds_the_views_that_stand_nearest_to_it(tmp_path):
     """In the last bytes of its file, so that bricks come first."""
     scene = with_details(scene_of(opaque_window(), opaque_window(1)), tmp_path / "details")
