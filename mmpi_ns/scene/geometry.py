@@ -148,7 +148,7 @@ def _intersected_range(
     bound = offset / torch.where(slope == 0, torch.ones_like(slope), slope)
     upper = torch.where(slope > 0, bound, torch.full_like(bound, torch.inf)).amin(0)
     lower = torch.where(slope < 0, bound, torch.full_like(bound, -torch.inf)).amax(0)
-    never = ((slope == 0) & (offset < 0)).any(0)
+    never = (((slope == 0) & (offset < 0)) | bound.isnan()).any(0)  # NaN: a ray from nowhere
     high = torch.minimum(upper.floor(), last).clamp(min=-1)
     low = torch.minimum(lower.ceil().clamp(min=0), last + 1)
     low, high = torch.where(never, last + 1, low), torch.where(never, torch.full_like(high, -1), high)

@@ -35,7 +35,7 @@ class Votes(NamedTuple):
     """Votes of rays with a depth prior for each of the T rows of the tables."""
 
     surface: Float[Tensor, "T"]
-    """Votes for a surface; those of one ray, on all planes within the error of its depth, sum to about one."""
+    """Votes for a surface; those of one ray, on all planes within the error of its depth, sum to one or two."""
     empty: Float[Tensor, "T"]
     """Votes for empty space: rays whose surface lies behind."""
     colors: Float[Tensor, "T 3"]

@@ -98,7 +98,7 @@ class Schedule:
     def refines_at(self, step: int, copies: bool = False) -> bool:
         """Whether texels may become finer than planned before this step: at releases after the last growth, as long as
         rates are high. ``copies``: whether MPIs may get finer copies, which wait until all texels had time to."""
-        high = self.decay_from * self.phases[0].end
+        high = round(self.decay_from * self.phases[0].end)  # rounded as releases are
         is_high = max(self._grown, COPIES_FROM * high if copies else 0) < self._local(step) <= high
         return is_high and self.releases_at(step)
 

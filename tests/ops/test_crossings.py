@@ -68,4 +68,6 @@ def test_hard_rays_hit_the_planes_of_the_reference(origin, direction):
 def test_rays_that_are_not_numbers_and_no_rays_hit_nothing():
     mpis = [make_mpi()]
     assert not found_and_wanted(mpis, (0, 0, 0), (math.nan, math.nan, math.nan))[0].count.any()
+    for origin in ((math.nan, 0, 0), (0, 0, math.nan), (math.inf, 0, 0), (0, 0, -math.inf)):
+        assert not found_and_wanted(mpis, origin, (0, 0, 1))[0].count.any()
     assert found_and_wanted(mpis, np.zeros((0, 3)), np.zeros((0, 3)))[0].count.shape == (0, 1)

@@ -54,6 +54,9 @@ def test_texels_may_become_finer_at_releases_after_growth_while_rates_are_high()
     shares = {"release_shares": (3 / 15, 4 / 15, 0.3, 0.5, 0.75), "decay_from": 0.5}
     schedule = schedule_of("joint", 1_000, windows=2, **shares)
     assert [s for s in range(2_000) if schedule.refines_at(s)] == [300, 500, 1_300, 1_500]
+    for steps, middle in ((1_000, 500), (1_001, 500), (1_002, 501), (1_175, 588), (4_999, 2_500)):  # rounded alike
+        schedule = schedule_of("joint", steps, **shares)
+        assert [s for s in schedule.release if schedule.refines_at(s, copies=True)] == [middle]
     schedule = schedule_of("joint", 1_000, **(shares | {"release_weight": 0.0}))
     assert not any(schedule.refines_at(s) for s in range(1_000)), "nothing is released"
 

@@ -76,7 +76,7 @@ struct Crossing {
             const Lanes bound = rest / pick(slope == 0, splat(1), slope);
             high = pick(slope > 0, least(bound, high), high);
             low = pick(slope < 0, most(bound, low), low);
-            never |= (slope == 0) & (rest < 0);
+            never |= ((slope == 0) & (rest < 0)) | (bound != bound); // NaN: a ray from nowhere
         }
         high = pick(never, splat(-1), floored(most(high, splat(-1))));
         low = pick(never, splat(mpi.last + 1), -floored(-least(low, splat(mpi.last + 1))));

@@ -59,7 +59,7 @@ struct Cell {
     Cell(float coordinate, int64_t size) {
         const float last = float(size - 1);
         float position = (coordinate + 1) * (0.5f * last);
-        position = std::min(std::max(position, 0.0f), last);
+        position = std::min(std::max(0.0f, position), last); // in this order NaN becomes 0
         const float floor = std::min(std::floor(position), last - 1);
         lower = int64_t(floor);
         fraction = position - floor;
@@ -94,7 +94,7 @@ inline float trilinear(const float* table, const Grid& grid, const float* ndc) {
 inline int64_t nearest_texel(const Grid& grid, const float* ndc) {
     const auto nearest = [](float coordinate, int64_t size) {
         const float last = float(size - 1);
-        return int64_t(std::min(std::max(std::nearbyint((coordinate + 1) * (0.5f * last)), 0.0f), last));
+        return int64_t(std::min(std::max(0.0f, std::nearbyint((coordinate + 1) * (0.5f * last))), last));
     };
     const int64_t x = nearest(ndc[0], grid.width), y = nearest(ndc[1], grid.height);
     return row_in_brick(*grid.tile(nearest(ndc[2], grid.depth), y, x), y, x);

@@ -114,7 +114,7 @@ def _narrow(low, high, never, p, q, step, end):
     bound = rest / tl.where(slope == 0, 1.0, slope)
     high = tl.where(slope > 0, tl.minimum(high, bound), high)
     low = tl.where(slope < 0, tl.maximum(low, bound), low)
-    return low, high, never | ((slope == 0) & (rest < 0))
+    return low, high, never | ((slope == 0) & (rest < 0)) | (bound != bound)
 
 
 @triton.jit
