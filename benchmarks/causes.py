@@ -73,12 +73,12 @@ def causes(pipeline: Any, count: int) -> Row:
     for i in np.linspace(0, len(training) - 1, min(count or len(training), len(training))).round().astype(int):
         factor = model.exposures.factors[i] if len(model.exposures.factors) else 1.0
         rgb = (factor * renderings[i].get("radiance", renderings[i]["rgb"])).clamp(0, 1)
-        scores["training images"].append(psnr_of(squared(rgb, training.get_image_float32(int(i))[..., :3])))
+        scores["training images"].append(psnr_of(squared(rgb, model.observed(training.get_data(int(i))))))
     parts = []
     for i, (camera, image) in enumerate(images_of(pipeline, count)):
         outputs = pipeline.as_exposed(camera, model.get_outputs_for_camera(camera), image)
         with torch.enable_grad():
-            moved = refined_camera(model, camera, image, model.config.seed + i)[0]
+            moved = refined_camera(pipeline, camera, image, model.config.seed + i)[0]
         again = pipeline.as_exposed(moved, model.get_outputs_for_camera(moved), image)
         plain, fitted = squared(outputs["rgb"], image), squared(color_correct(again["rgb"], image), image)
         seen = times_seen(camera, outputs["depth"][..., 0].cpu().numpy(), posed, distances)

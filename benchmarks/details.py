@@ -66,7 +66,7 @@ def scores(pipeline: Any, config: Path, count: int) -> Row:
     kept, making = details_of_run(pipeline, config)
     values: dict[str, list[tuple[float, float, float]]] = {}
     for i in np.linspace(0, len(images) - 1, min(count or len(images), len(images))).round().astype(int).tolist():
-        observed = images.get_data(i, image_type="float32")["image"][..., :3].to(model.device)
+        observed = model.observed(images.get_data(i))
         camera = images.cameras[i : i + 1].to(model.device)
         bundle, field = image_rays(camera), model.get_outputs_for_camera(camera)
         exposure = model.exposures.mean

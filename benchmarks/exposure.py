@@ -127,7 +127,7 @@ def markdown(content: Row) -> str:
         "capture": "{name}",
         "training images": "{images}",
         "corrected": lambda row: "yes" if row["corrected"] else "no",
-        "span of 80 %": lambda row: f"{row['span']:.2f}" if "span" in row else "equal in EXIF",
+        "span of 80 %": lambda row: f"{row['span']:.2f}" if "span" in row else "not known",
         "colours differ by": percent("disagreement"),
         "after gains": percent("left"),
         "error of gains, median": percent("median_error"),

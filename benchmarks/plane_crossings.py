@@ -21,7 +21,7 @@ def images_of(pipeline: Any, count: int = 0) -> Iterator[Image]:
     """Test images of a finished run, evenly spaced; 0 for all."""
     data, device = pipeline.datamanager.eval_dataset, pipeline.model.device
     for i in evenly(len(data), count):
-        yield data.cameras[i : i + 1].to(device), data.get_image_float32(i)[..., :3]
+        yield data.cameras[i : i + 1].to(device), pipeline.model.observed(data.get_data(i))
 
 
 def crossings(hits: PlaneHits, frames: Frames, k: int, planes: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -72,7 +72,7 @@ def refined_scores(run: Path) -> Row:
     """Means over the test images of a run, each at the pose from which its frozen model renders it best."""
     pipeline, rows = load_model(run / "config.yml"), []
     for i, (camera, image) in enumerate(images_of(pipeline)):
-        moved_camera, degrees, _ = refined_camera(pipeline.model, camera, image, i)
+        moved_camera, degrees, _ = refined_camera(pipeline, camera, image, i)
         outputs = pipeline.as_exposed(moved_camera, pipeline.model.get_outputs_for_camera(moved_camera), image)
         rows.append(psnr_and_ssim(outputs["rgb"], image) | {"rotation_degrees": degrees})
     return {f"refined_{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}

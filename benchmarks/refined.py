@@ -21,14 +21,14 @@ RATES = (2e-3, 5e-5)
 """Learning rates at the start and at the end: radians, and scene units."""
 
 
-def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:
-    """A camera refined to the pose from which a frozen model renders its image best.
+def refined_camera(pipeline: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:
+    """A camera refined to the pose from which a frozen model renders its image best, at the exposure of the image.
 
     If the training poses were wrong, or were refined, the model does not match the test poses exactly. The pose is
     optimised by the colours of the same pixels that are then scored, so this is no score of view synthesis.
 
     Args:
-        model: ``MMPIModel``, in evaluation.
+        pipeline: ``MMPIPipeline``, in evaluation.
         camera: one.
         image: [H, W, 3] of it, over the model's background.
         seed: of the draw of pixels.
@@ -36,6 +36,10 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
     Returns:
         The refined camera, its rotation in degrees, and its translation in scene units.
     """
+    model, maker, exposure = pipeline.model, pipeline.datamanager.maker, None
+    if model.exposures.mean is not None:  # as MMPIPipeline.as_exposed
+        exposures, outputs = (model.exposures.factors, model.exposures.falloff), model.get_outputs_for_camera(camera)
+        exposure = maker.exposure_of(pipeline.datamanager.observations, *exposures, camera, image, outputs)
     adjustment: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=model.device)
     optimizer = torch.optim.Adam(adjustment.parameters(), lr=RATES[0])
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1 / STEPS))
@@ -49,7 +53,9 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
             bundle.camera_indices = torch.zeros_like(chosen, device=model.device)[:, None]
             with torch.enable_grad():
                 adjustment.apply_to_raybundle(bundle)
-                loss = ((model.image_outputs(bundle)["rgb"] - observed[chosen]) ** 2).mean()
+                outputs = model.image_outputs(bundle)
+                rgb = outputs["rgb"] if exposure is None else (exposure * outputs["radiance"]).clamp(0, 1)
+                loss = ((rgb - observed[chosen]) ** 2).mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
