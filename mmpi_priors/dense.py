@@ -271,7 +271,7 @@ def without_fringes(view: View, depth: Depth) -> Depth:
 
 
 def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Depth:
-    """Depths that at least one other image confirms, and at least as many as contradict them."""
+    """Depths that more of the other images confirm than contradict."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
     for neighbour, theirs in others:
         here, there = ((torch.from_numpy(d.inverse), torch.from_numpy(d.error)) for d in (depth, theirs))
@@ -279,5 +279,5 @@ def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Dep
         confirms, contradicts = compare_depths(*here, *there, *parallax, SAME_DEPTH)
         confirm += confirms.numpy()
         contradict += contradicts.numpy()
-    kept = (confirm >= 1) & (confirm > contradict)
+    kept = confirm > contradict
     return Depth(np.where(kept, depth.inverse, 0), np.where(kept, depth.error, 0))

@@ -32,7 +32,7 @@ from mmpi_priors.cache import Computed, digest, kept
 from mmpi_priors.clouds import POINT_ERROR, contradict, see_points
 from mmpi_priors.dense import Depth, find_depths
 from mmpi_priors.lone_depth import continued, is_lone
-from mmpi_priors.observe import drop_masked
+from mmpi_priors.observe import drop_masked, opaque
 from mmpi_priors.views import Map, View, look_up, straightened, strips
 
 FINER, LONGEST = 2.0, 1600
@@ -183,12 +183,12 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
 def with_continued(depths: DepthPriors, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> DepthPriors:
     """Depths with surfaces extrapolated into regions that hardly any other image sees (``lone_depth.py``); cached.
 
-    Masked pixels get no distance: moving objects have no fixed position.
+    Masked and transparent pixels get no distance: moving objects have no fixed position, what is cut out has none.
     """
 
     def codes_of(i: int) -> Codes:
         """Computed for every n-th pixel of a large image."""
-        codes, hidden = np.array(depths.codes[i]), ~dataset.usable(i)[..., None]
+        codes, hidden = np.array(depths.codes[i]), ~opaque(dataset, i)[..., None]
         np.copyto(codes, UNKNOWN, where=hidden)
         step = -(-max(codes.shape[:2]) // CONTINUED)
         rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
@@ -206,7 +206,8 @@ def with_continued(depths: DepthPriors, posed: PosedImages, dataset: MMPIDataset
         return codes
 
     count = len(depths.codes)
-    masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
+    is_cut = dataset.has_masks or dataset.has_alpha
+    masks = [digest((), opaque(dataset, i)) for i in range(count)] if is_cut else []
     contents = [digest((), codes) for codes in depths.codes]
     work = "Extrapolating surfaces"
     return _kept(

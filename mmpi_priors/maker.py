@@ -24,7 +24,7 @@ from mmpi_priors.depth_priors import make_depth_priors, of_cells
 from mmpi_priors.moving import moving_masks, share_of_moving
 from mmpi_priors.new_views import find_shared_points
 from mmpi_priors.observe import drop_masked, observe
-from mmpi_priors.photometry import SAME_LIGHT, color_ratios, exposure_of_image, image_gains
+from mmpi_priors.photometry import color_ratios, exposure_of_image, image_gains
 from mmpi_priors.settings import CapturePriorsConfig
 
 
@@ -49,8 +49,9 @@ class CapturePriors(PriorsMaker):
             # A mask file of the user takes precedence.
             masks, doubt = self._moving(observations)
             masks = [mask & (file is None) for mask, file in zip(masks, dataset.mask_files, strict=True)]
-            movers, is_masked = share_of_moving(masks), any(mask.any() for mask in masks)
+            is_masked = any(mask.any() for mask in masks)
             if is_masked or not doubt:
+                movers = share_of_moving(masks)
                 log(movers + (" (--pipeline.datamanager.priors.mask-moving False keeps them)." if is_masked else "."))
             if doubt:
                 log(doubt, "yellow")
@@ -71,7 +72,8 @@ class CapturePriors(PriorsMaker):
         shapes = [(int(h), int(w)) for w, h in observations.sizes]
         posed = posed_images(observations, self.dataset)
         if posed is None:
-            return [np.zeros(shape, bool) for shape in shapes], ""
+            doubt = "Moving objects are not searched for: a camera is neither perspective nor fisheye, or has a k4."
+            return [np.zeros(shape, bool) for shape in shapes], doubt
         return moving_masks(at_full_size(posed), shapes, *observations.tracked)
 
     def gains(self, observations: Observations, depths: DepthPriors | None) -> Gains | None:
@@ -79,13 +81,10 @@ class CapturePriors(PriorsMaker):
         posed = posed_images(observations, self.dataset)
         if depths is None or posed is None or len(posed.files) < 2:
             return None
-        light = np.array([light_of(file) for file in at_full_size(posed).files])
-        if np.isfinite(light).all() and np.ptp(np.log(light)) < SAME_LIGHT:
-            log("Exposure: EXIF notes the same for all images.")
-            return None
         ratios = color_ratios(posed, depths, self.rays, lambda i: image_and_mask(self.dataset, i), self.seed)
         if ratios is None:
             return None
+        light = np.array([light_of(file) for file in at_full_size(posed).files])
         gains = image_gains(ratios, len(posed.files), light)
         log(gains.describe())
         return gains

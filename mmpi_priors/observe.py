@@ -19,7 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from mmpi_ns.data.checks import log_once
-from mmpi_ns.data.dataset import MMPIDataset
+from mmpi_ns.data.dataset import MMPIDataset, image_and_mask
 from mmpi_ns.data.posed_images import PosedImages, at_full_size, camera_observations, posed_images
 from mmpi_ns.placement.observations import Array, Observations, nearest_views
 from mmpi_ns.utils.errors import InputError, quoted
@@ -263,13 +263,19 @@ def with_tracks(observations: Observations, model: SfmModel, files: Sequence[Pat
     )
 
 
+def opaque(dataset: MMPIDataset, i: int) -> NDArray[np.bool_]:
+    """Mask of the usable pixels of an image that are not transparent. [H, W]"""
+    return image_and_mask(dataset, i)[1] > 0 if dataset.has_alpha else dataset.usable(i)
+
+
 def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observations:
-    """Drops keypoints on masked pixels: moving objects have no depth to learn from."""
-    if not len(observations.seen_at) or not dataset.has_masks:
+    """Drops keypoints on masked or transparent pixels: moving objects have no depth to learn from, and what a
+    transparent pixel shows is cut out."""
+    if not len(observations.seen_at) or not (dataset.has_masks or dataset.has_alpha):
         return observations
     keep = np.ones(len(observations.seen_by), dtype=bool)
     for i in range(len(dataset)):
-        mask = dataset.usable(i)
+        mask = opaque(dataset, i)
         keypoints = np.nonzero(observations.seen_by[: len(observations.seen_at)] == i)[0]
         x, y = observations.seen_at[keypoints].astype(int).T
         keep[keypoints] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]

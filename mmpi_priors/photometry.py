@@ -66,8 +66,6 @@ LOOSE = 1.0
 FOLDS = 5
 OPAQUE = 0.9
 """Accumulation from which a pixel's depth is that of a surface."""
-SAME_LIGHT = 0.03
-"""Range of log exposures in EXIF within which they are equal."""
 ROUNDS = 20
 
 

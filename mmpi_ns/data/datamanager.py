@@ -186,8 +186,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             self.sources = self._resident if cameras is None else self._resident.of_images(cameras)
 
     def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
-        """Pixels, new views and keypoints of all training cameras, or of some; prints if only a subset of the pixels is
-        used."""
+        """Pixels, new views and keypoints of all training cameras, or of some; says if only some pixels are used."""
         config, images = self.config, list(range(len(self.train_dataset))) if cameras is None else cameras.tolist()
         total, most = self._pixels[images].sum(), int(config.resident_pixels)
         if 0 < most < total:
@@ -230,8 +229,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(**loaders)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``; with several threads, those of the next
-        step are drawn meanwhile.
+        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``; several threads draw the next's, too.
 
         Outside training (ns-export always requests step 0) only pixel rays, different ones in each call.
         """

@@ -6,7 +6,7 @@ Here it is made from the cameras alone; ``mmpi_priors`` computes the rest from t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -96,16 +96,16 @@ class Gains:
 
     @property
     def span(self) -> float:
-        """Ratio of the green factors that bound 80 % of the images."""
-        low, high = np.quantile(self.factors[:, 1], [0.1, 0.9])
-        return float(high / low)
+        """Ratio of the factors that bound 80 % of the images, in the channel that varies most."""
+        low, high = np.quantile(self.factors, [0.1, 0.9], axis=0)
+        return float((high / low).max())
 
     def describe(self) -> str:
         """Whether and how much exposure varies, in one sentence."""
         before, after, error = (100 * x for x in (self.disagreement, self.corrected, float(np.median(self.errors))))
         differ = f"where images show the same, colours differ by {before:.1f} %"
         if self.matter:
-            varies = f"Exposure varies {self.span:.2f}-fold between images and is corrected"
+            varies = f"Exposure or white balance varies {self.span:.2f}-fold between images and is corrected"
             return f"{varies}: {differ}, and by {after:.1f} % after that."
         factors = f"by {after:.1f} % with a factor for each image, known to {error:.1f} %"
         return f"Exposure is not corrected: {differ}, and {factors}."
@@ -142,11 +142,12 @@ class SharedPoints:
     cover: float
     """Number of points divided by the number of pixels; limits how often each point is drawn."""
 
-    def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
-        """The points shared by two of the given images; None if there is none."""
-        images, names = images.to(self.pixels), ("pixels", "other", "colors", "depths")
+    def of_images(self, images: Int[Tensor, "I"], share: float) -> SharedPoints | None:
+        """The points shared by two of the given images, which have a share of all pixels; None if there is none."""
+        images, cover = images.to(self.pixels), self.cover / len(self.pixels) / share
         shared = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
-        return replace(self, **{name: getattr(self, name)[shared] for name in names}) if len(shared) else None
+        columns = (x[shared] for x in (self.pixels, self.other, self.colors, self.depths))
+        return SharedPoints(*columns, self.centers, cover * len(shared)) if len(shared) else None
 
     def draw(
         self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None

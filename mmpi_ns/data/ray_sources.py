@@ -165,10 +165,11 @@ class RaySources:
             cameras = keypoints.camera_indices[:, 0]
             kept = torch.isin(cameras, numbers.to(cameras)).nonzero()[:, 0]
             keypoints = keypoints[kept] if len(kept) else None
+        pixels = replace(pool, **{n: getattr(pool, n)[left] for n in ("images", "widths", "begins", "ends")})
         return replace(
             self,
-            pixels=replace(pool, **{n: getattr(pool, n)[left] for n in ("images", "widths", "begins", "ends")}),
-            new_views=self.new_views and self.new_views.of_images(numbers),
+            pixels=pixels,
+            new_views=self.new_views and self.new_views.of_images(numbers, pixels.count / pool.count),
             keypoints=keypoints,
         )
 

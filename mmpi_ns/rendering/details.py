@@ -267,7 +267,7 @@ def write_details(
         masked = torch.from_numpy(usable == 0).to(factor.device)
         arrays = {
             "difference": difference.round().clamp(-LEVELS, LEVELS).to(torch.int8).cpu().numpy(),
-            "inverse": torch.where(masked, -1.0, 1 / outputs["depth"][..., 0]).half().cpu().numpy(),
+            "inverse": torch.where(masked, -1.0, 1 / outputs["depth"][..., 0]).clamp(max=6e4).half().cpu().numpy(),
         }
         path = folder / f"{i:05d}.npz"
         write_atomically(path, partial(write_arrays, arrays=arrays))

@@ -43,8 +43,8 @@ class MMPIPipeline(VanillaPipeline):
                 save_image(image.permute(2, 0, 1).cpu(), cast(Path, output_path) / f"{image_prefix}_{name}_{n:04d}.png")
             scores.append((names[int(batch["image_idx"])], values))
         means: dict[str, float] = {}
-        for name in scores[0][1]:
-            each = [values[name] for _, values in scores]
+        for name in dict.fromkeys(name for _, values in scores for name in values):
+            each = [values[name] for _, values in scores if name in values]  # depth_error: where a depth is known
             means[name] = float(np.mean(each))
             if get_std:
                 means[f"{name}_std"] = float(np.std(each, ddof=1)) if len(each) > 1 else 0.0

@@ -115,6 +115,31 @@ def test_transparency_reaches_the_batch(tmp_path):
     assert torch.equal(batch["image"][:, 3] == 0, batch["indices"][:, 1] < HEIGHT // 4)
 
 
+def test_moving_objects_that_are_not_searched_for_are_not_said_to_be_absent(scene, monkeypatch, capsys):
+    monkeypatch.setattr("mmpi_priors.maker.posed_images", lambda *_: None)  # as of a camera of another kind
+    manager = datamanager(scene)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Moving objects are not searched for" in said
+    assert "No moving objects" not in said and not manager.priors.movers
+
+
+def test_transparent_pixels_have_no_depth_whatever_their_colours(tmp_path, manager):
+    """A cut-out whose colours are kept below: the wall is seen there, and is not to be there."""
+    data, cut = write_scene(tmp_path / "cut"), slice(HEIGHT // 2, HEIGHT // 2 + 6)
+    for i in range(8):
+        path = data / "images" / name_of(i)
+        image = np.dstack([np.array(Image.open(path)), np.full((HEIGHT, WIDTH), 255, np.uint8)])
+        image[cut, :, 3] = 0
+        Image.fromarray(image).save(path)
+    priors = datamanager(data).priors
+    for i in range(len(TRAIN)):
+        assert (manager.priors.depths.image(i)[cut, :, 0] > 0).any()
+        known = priors.depths.image(i)[..., 0] > 0
+        assert not known[cut].any() and known.any()
+    rows = priors.observations.seen_at[:, 1].astype(int)
+    assert len(rows) and not ((rows >= cut.start) & (rows < cut.stop)).any()
+
+
 def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
     observations = manager.observations
     wall = wall_in_scene_units(manager)
@@ -165,6 +190,7 @@ def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(s
     manager.use_cameras(np.array([0, 1, 2]))
     own = manager.sources.new_views
     assert set(own.pixels[:, 0].tolist()) | set(own.other.tolist()) <= {0, 1, 2}
+    assert own.cover == pytest.approx(len(own.pixels) / (3 * WIDTH * HEIGHT))
     assert set(manager.sources.keypoints.camera_indices[:, 0].tolist()) == {0, 1, 2}
     manager.use_cameras(None)
     assert len(manager.sources.new_views.pixels) == count

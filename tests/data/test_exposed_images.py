@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WALL, WIDTH, color_of, expose, on_wall, write_scene
 from training_runs import datamanager, in_capture_frame
 
@@ -29,6 +30,19 @@ def test_factors_of_the_training_images_are_recovered(manager, capsys):
     error = np.log(manager.priors.gains.factors) - (truth - truth.mean(0))
     assert np.abs(error).max() < 0.05
     assert manager.train_dataset.metadata[CAPTURE].gains is manager.priors.gains
+
+
+@pytest.mark.parametrize("dated", [False, True])
+def test_white_balance_is_calibrated_where_green_stays_also_at_one_exposure_by_exif(tmp_path, dated):
+    """As with a camera whose exposure is locked, and whose white balance is not."""
+    factors, exif = FACTORS * [[1, 0, 1]] + [[0, 0.8, 0]], Image.Exif()
+    exif[0x8769] = {33434: 0.01, 33437: 1.8, 34855: 100}  # time, f-number, ISO
+    data = expose(write_scene(tmp_path / "balanced"), factors)
+    for path in (data / "images").iterdir() if dated else ():
+        Image.open(path).copy().save(path, exif=exif)
+    truth = np.log(factors[list(TRAIN)])
+    error = np.log(datamanager(data).priors.gains.factors) - (truth - truth.mean(0))
+    assert np.abs(error).max() < 0.08
 
 
 def test_batches_hold_colours_at_one_exposure_whichever_image_they_come_from(manager):

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 import sys
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
 from nerfstudio.utils.eval_utils import eval_setup
 from refined import refined_camera
 from tiny_scene import write_scene
 from training_runs import compared, differences, load, ready, trainer_config, write_plan, write_windows
 
-from mmpi_ns.data.rays import TrainingRays
+from mmpi_ns.data.rays import TrainingRays, image_rays
 from mmpi_ns.rendering.metrics import psnr
 from mmpi_ns.training.run import move_rays
 from mmpi_ns.utils.errors import InputError
@@ -146,10 +148,30 @@ def test_a_turned_test_image_is_turned_back_against_the_frozen_model(turned):
     pipeline.eval()
     data = pipeline.datamanager.eval_dataset
     camera, image = data.cameras[0:1], data.get_image_float32(0)
-    moved, degrees, _ = refined_camera(model, camera, image, 0)
+    moved, degrees, _ = refined_camera(pipeline, camera, image, 0)
     scores = [psnr(model.get_outputs_for_camera(c)["rgb"], image) for c in (camera, moved)]
     assert scores[1] > scores[0] + 0.5 and degrees == pytest.approx(np.degrees(OFF), rel=0.5)
     assert model.field.density.requires_grad, "the field can be trained on"
+
+
+def test_a_turned_test_image_is_compared_at_its_own_exposure():
+    def radiance(bundle):
+        x, y = bundle.directions[:, :1], bundle.directions[:, 1:2]
+        waves = 0.5 + 0.4 * torch.sin(torch.cat([8 * x, 7 * y, 6 * (x + y)], -1))
+        return {"rgb": waves, "radiance": waves}
+
+    exposure, pose, lens = torch.tensor([0.5, 0.6, 0.7]), torch.eye(4)[None, :3], (40.0, 40.0, 16.0, 12.0, 32, 24)
+    image = (exposure * radiance(image_rays(Cameras(pose, *lens)).flatten())["rgb"]).view(24, 32, 3)
+    turned_pose = pose.clone()
+    turned_pose[:, :, :3] = exp_map_SO3xR3(torch.tensor([[0.0, 0, 0, 0, OFF / 3, 0]]))[:, :, :3]
+    exposures = SimpleNamespace(mean=torch.ones(3), factors=torch.ones(1, 3), falloff=torch.zeros(2, 3))
+    model = SimpleNamespace(device="cpu", exposures=exposures, image_outputs=radiance, parameters=list)
+    model.get_outputs_for_camera = lambda _: {}
+    maker = SimpleNamespace(exposure_of=lambda *_: exposure)
+    pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(maker=maker, observations=None))
+    moved, degrees, _ = refined_camera(pipeline, Cameras(turned_pose, *lens), image, 0)
+    assert torch.allclose(moved.camera_to_worlds[..., :3], pose[..., :3], atol=OFF / 12)
+    assert degrees == pytest.approx(np.degrees(OFF / 3), rel=0.25)
 
 
 @pytest.mark.parametrize("part", ["origins", "directions"])

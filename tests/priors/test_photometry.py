@@ -103,6 +103,7 @@ def test_gains_that_are_uncertain_explain_little_or_hardly_vary_do_not_matter():
         np.full(11, 0.1),
     )
     assert Gains(factors, sure, FLAT, 0.1, 0.02).matter
+    assert Gains(factors ** [1, 0, -1], sure, FLAT, 0.1, 0.02).matter, "white balance leaves green as it is"
     assert not Gains(factors, unsure, FLAT, 0.1, 0.02).matter and not Gains(factors, sure, FLAT, 0.187, 0.18).matter
     assert not Gains(np.ones((11, 3)), unsure, FLAT, 0.01, 0.002).matter
 

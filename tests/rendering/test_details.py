@@ -141,6 +141,13 @@ def test_an_image_at_a_training_camera_gets_its_details(tmp_path):
     )
 
 
+def test_surfaces_too_near_for_half_precision_give_finite_colours(tmp_path):
+    write(tmp_path, joined(camera()), [random_planes(0, 1e-6)])
+    field = {name: torch.full((HEIGHT, WIDTH, 3), 0.5) for name in ("rgb", "radiance")}
+    near = {"depth": torch.full((HEIGHT, WIDTH, 1), 1e-6), "accumulation": torch.ones(HEIGHT, WIDTH, 1)}
+    assert read_details(tmp_path).added(field | near, image_rays(camera()), 1, None)["rgb"].isfinite().all()
+
+
 def test_what_was_learned_of_one_image_alone_is_not_lost_in_others(tmp_path):
     """A field that fits its training image leaves no difference there; where it lacks in another, a part comes back."""
     planes = [torch.cat([torch.zeros(3, HEIGHT, WIDTH), torch.full((1, HEIGHT, WIDTH), 0.25)])]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from mmpi_ns.rendering import metrics
 from mmpi_ns.rendering.metrics import pictures, psnr, ssim
+from mmpi_ns.rendering.pipeline import MMPIPipeline
 
 
 def ssim_of(a, b):
@@ -48,3 +52,16 @@ def test_pictures_of_more_pixels_than_torch_sorts_are_made():
     rendered = pictures(one.expand(side, side, 3), outputs, 2)["inverse_depth"]
     brightest = torch.quantile(row, 0.98)
     assert torch.allclose(rendered[1234, :, 0], (row / brightest).clamp(max=1), atol=1e-3)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_score_that_an_image_lacks_is_the_mean_over_the_others(order):
+    """A depth image may be empty, and an image too small for SSIM."""
+    scores = [{"psnr": 20.0, "depth_error": 0.1, "ssim": 0.5}, {"psnr": 22.0}]
+    loader, pipeline = MagicMock(), MagicMock()
+    loader.input_dataset.image_filenames = ["a.png", "b.png"]
+    camera = SimpleNamespace(width=4, height=3)
+    loader.__iter__.side_effect = lambda: iter([(camera, {"image_idx": i}) for i in order])
+    pipeline.score.side_effect = lambda _, batch: (dict(scores[batch["image_idx"]]), {})
+    means = MMPIPipeline.get_average_image_metrics(pipeline, loader, "eval", get_std=True)
+    assert (means["psnr"], means["depth_error"], means["ssim"]) == (21.0, 0.1, 0.5) and means["depth_error_std"] == 0
