@@ -141,7 +141,8 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> GivenPoses:
     if len(poses) < len(photos):
         log(f"{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.", "yellow")
     centers = np.array([pose[:3, 3] for pose in poses.values()])
-    if np.abs(centers).max() > MAP_COORDINATES * np.ptp(centers, axis=0).max() > 0:
+    extent = np.ptp(centers, axis=0).max()
+    if extent > 0 and np.abs(centers).max() > min(MAP_COORDINATES * extent, 1e5):  # float32 rounds 1e5 to 0.01
         origin = np.round(centers.mean(0))
         for pose in poses.values():
             pose[:3, 3] -= origin

@@ -50,7 +50,7 @@ class Capture:
     rays_per_step: int
     """Pixel rays of a training step."""
     has_depths: bool
-    """Whether enough pixels have a depth prior to start training with surfaces."""
+    """Whether enough pixels have a depth prior for surfaces to form early."""
     gains: Gains | None
     """Exposures of the images; None if they are equal."""
 

@@ -134,7 +134,7 @@ class Schedule:
 
 
 def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, has_depths: bool = False) -> Schedule:
-    """The schedule of a run of ``total_steps`` steps a window; nothing is released before surfaces have formed.
+    """The schedule of a run of ``total_steps`` steps a window; nothing is released before texels have doubled.
     ``has_depths``: training starts with surfaces (``initial.py``). Raises InputError if no step is left for the first
     phase, growth goes backwards, or rates never fall."""
     if total_steps < 1:

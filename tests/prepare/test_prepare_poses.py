@@ -68,6 +68,15 @@ def test_every_format_gives_the_same_poses(form, tmp_path):
     assert read(path)[1] == pytest.approx(GIVEN, abs=1e-9)
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e4])
+def test_map_coordinates_get_an_origin_among_the_cameras(scale, tmp_path):
+    poses = GIVEN.copy()
+    poses[:, :3, 3] = scale * poses[:, :3, 3] + [4e5, 5.4e6, 100]
+    places = read(write_kitti(tmp_path / "poses.txt", poses))[1][:, :3, 3]
+    assert places - places[0] == pytest.approx(poses[:, :3, 3] - poses[0, :3, 3], abs=1e-2)
+    assert np.abs(places).max() < 2 * np.ptp(places, axis=0).max()
+
+
 def test_kitti_lines_are_chosen_by_the_images_numbers_where_there_are_more(tmp_path):
     path = write_kitti(tmp_path / "poses.txt", corridor.poses(30))
     photos = [Photo(f"{n:06d}.png", 9, 9, source=f"{n:06d}.png") for n in (3, 10, 25)]
