@@ -103,8 +103,8 @@ def seen_details(
     camera: Float[Tensor, "24"],
 ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 1"]]:
     """Interpolated residuals of an image at the surfaces of rays, and weights, 0 where it sees another surface or none.
-    These grow with the agreement of viewing directions and depths; residuals fade with the angle between the
-    directions.
+    These grow with the agreement of viewing directions and depths, and fall where the image is farther away from the
+    surface than the ray's origin; residuals fade with the angle between the directions.
 
     Args:
         origins: of the rays.
@@ -130,7 +130,8 @@ def seen_details(
     shift = camera[12] * towards.norm(dim=-1, keepdim=True)  # pixels for each unit of inverse depth
     margin = SAME_DEPTH * torch.maximum(there, here) + SAME_PIXELS / shift.clamp(min=TINY)
     turn = (relative / length - directions).norm(dim=-1, keepdim=True)
-    agrees = torch.exp(-((there - here) / margin).square().clamp(max=80)) / (turn + TURN)
+    coarser = length.clamp(min=1) ** 4
+    agrees = torch.exp(-((there - here) / margin).square().clamp(max=80)) / ((turn + TURN) * coarser)
     faded = (values[:, :3] - HERE * (radiance - MIDDLE)) / (1 + (turn / FADE).square())
     return faded, torch.where(inside[:, None] & (there >= 0), agrees, 0.0)
 
@@ -170,7 +171,7 @@ class Details:
         chosen = nearest_views(np.concatenate([self._poses, pose]), len(self._poses), nearest + 1, angle, apart=False)
         distances = np.linalg.norm(self._poses[chosen, :, 3] - pose[0, :, 3], axis=-1)
         limit = distances[-1] if len(chosen) > nearest and distances[-1] > 0 else np.inf
-        chosen, shares = chosen[:nearest], (1 - (distances / limit) ** 2)[:nearest].tolist()
+        chosen, shares = chosen[:nearest], ((1 - (distances / limit) ** 2) ** 2)[:nearest].tolist()
         views, details = [self.view(i, origins.device) for i in chosen], []
         disparities, radiance = 1 / outputs["depth"].reshape(-1, 1), outputs.get("radiance", outputs["rgb"])
         rays = origins, directions, disparities, radiance.reshape(-1, 3)

@@ -43,7 +43,7 @@ vec3 details(vec3 direction, float inverse, vec3 radiance) {
     float code = codesAt(depths, at / image.xy, ceil(image.xy / float(COARSE)), image.z).r;
     if (code < 0.5) continue;
     float root = max(code - 1.0, 0.0) / 254.0, angle = length(relative / far - direction);
-    float w = image.w * agreement(seenEye[i].w * root * root, inverse / far, seenLens[i].x * length(towards), angle);
+    float w = image.w * agreement(seenEye[i].w * root * root, inverse / far, seenLens[i].x * length(towards), angle, far);
     vec3 difference = seenStep * (codesAt(differences, at / image.xy, image.xy, image.z) - 128.0);
     total += w * faded(angle) * (difference - HERE * (radiance - MIDDLE));
     weight += w;

@@ -49,7 +49,7 @@ class Details {
       .map((view) => ({ view, far: Math.hypot(...add(view.eye, camera.eye, -1)) }))
       .sort((a, b) => a.far - b.far);
     const limit = near[this.nearest]?.far || Infinity;
-    return near.slice(0, this.nearest).map(({ view, far }) => ({ view, share: 1 - (far / limit) ** 2 }));
+    return near.slice(0, this.nearest).map(({ view, far }) => ({ view, share: (1 - (far / limit) ** 2) ** 2 }));
   }
 
   // Puts the images that a camera needs on the card.

@@ -22,6 +22,7 @@ from mmpi_ns.rendering.details import (
     LEVELS,
     MIDDLE,
     STRENGTH,
+    TURN,
     Details,
     DetailView,
     details_of,
@@ -32,6 +33,8 @@ from mmpi_ns.settings import MMPIModelConfig
 from mmpi_ns.utils.errors import InputError
 
 HEIGHT, WIDTH = 20, 28
+AT_CAMERA = STRENGTH / (1 + LEAST_WEIGHT * TURN)
+"""Factor on the residual of a single training image at its camera."""
 
 
 def camera(x=0.0, turn=0.0, kind=CameraType.PERSPECTIVE) -> Cameras:
@@ -58,11 +61,12 @@ def test_details_are_the_weighted_mean_of_the_views():
         cameras.append(numbers)
     cameras.append(cameras[-1].index_fill(0, torch.tensor([3]), 2.0))
     ray = RayBundle(torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0, -1]]]), torch.ones(1, 1, 1))
-    shares = [1 - (distance / 2) ** 2 for distance in (0.5, 1.0)]
+    shares = [(1 - (distance / 2) ** 2) ** 2 for distance in (0.5, 1.0)]
     angles = [2 * math.sin(math.atan(x / 5) / 2) for x in (0.5, 1.0)]
-    weights = [share / (angle + 0.01) for angle, share in zip(angles, shares, strict=True)]
+    farther = [math.hypot(x / 5, 1) for x in (0.5, 1.0)]
+    weights = [s / ((a + 0.01) * far**4) for a, s, far in zip(angles, shares, farther, strict=True)]
     faded = [
-        (value - HERE * (0.3 - MIDDLE)) / (1 + (angle / 0.2) ** 2)
+        (value - HERE * (0.3 - MIDDLE)) / (1 + (angle / 0.3) ** 2)
         for angle, value in zip(angles, (0.2, -0.1), strict=True)
     ]
     expected = STRENGTH * (faded[0] * weights[0] + faded[1] * weights[1]) / (sum(weights) + LEAST_WEIGHT)
@@ -130,7 +134,7 @@ def test_an_image_at_a_training_camera_gets_its_details(tmp_path):
     outputs = {"depth": 1 / planes[0][3][..., None], "accumulation": torch.ones(HEIGHT, WIDTH, 1),
                "rgb": field}  # fmt: skip
     result = read_details(tmp_path).added(outputs, bundle, 4, None)
-    expected = STRENGTH * planes[0][:3].movedim(0, -1)
+    expected = AT_CAMERA * planes[0][:3].movedim(0, -1)
     assert torch.allclose(result["rgb"], (field + expected).clamp(0, 1), atol=4e-3)
     assert torch.equal(result["field_rgb"], field)
     double = read_details(tmp_path).added(outputs, bundle, 4, torch.full((3,), 2.0))
@@ -155,7 +159,7 @@ def test_what_was_learned_of_one_image_alone_is_not_lost_in_others(tmp_path):
     whole = torch.ones(HEIGHT, WIDTH, 1)
     outputs = {"depth": 4 * whole, "accumulation": whole, "rgb": 0.3 * whole.expand(-1, -1, 3)}
     added = read_details(tmp_path).added(outputs, image_rays(camera()), 4, None)["rgb"] - 0.3
-    assert torch.allclose(added, torch.tensor(STRENGTH * HERE * (128 / 255 - 0.3)), atol=4e-3)
+    assert torch.allclose(added, torch.tensor(AT_CAMERA * HERE * (128 / 255 - 0.3)), atol=4e-3)
 
 
 def test_other_surfaces_masks_and_empty_pixels_show_nothing(tmp_path):

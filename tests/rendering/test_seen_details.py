@@ -81,7 +81,7 @@ def oracle(cameras, image, origin, direction, inverse, radiance):
     here, baseline = inverse / length, np.linalg.norm(origin - pose[:, 3])
     margin = SAME_DEPTH * max(there, here) + SAME_PIXELS / max(float(cameras.fx) * baseline, 1e-9)
     turn = np.linalg.norm(relative / length - direction)
-    weight = math.exp(-min(((there - here) / margin) ** 2, 80)) / (turn + TURN)
+    weight = math.exp(-min(((there - here) / margin) ** 2, 80)) / (turn + TURN) / max(length, 1) ** 4
     difference = np.array(difference) - HERE * (radiance - MIDDLE)
     return weight, weight * difference / (1 + (turn / FADE) ** 2)
 
