@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from lab import figure
 from plane_crossings import AHEAD
-from random_scenes import Array, bundle_of, of_slots, render
+from random_scenes import Array, bundle_of, render
 from report import Bench, Report, Row, page, table
 from solids import Solids, bake
 
@@ -62,8 +62,8 @@ def measure(solids: Solids, mpis: list[MPIPlan], blends: bool = False) -> dict[s
         results = render(field, bundle_of(origins, directions), THRESHOLD, blends)
     t = solids.hit(origins, directions)
     exact = solids.color(origins + t[:, None] * directions)
-    slots = (of_slots(results, name) for name in ("inverse_t", "valid"))
-    depth = np.abs(median_inverse_distance(results.composite.weights, *slots)[:, 0].double().numpy() - 1 / t)
+    inverse_t = median_inverse_distance(results.composite.weights, results.samples.inverse_t, results.samples.starts)
+    depth = np.abs(inverse_t[:, 0].double().numpy() - 1 / t)
     color = np.abs(results.rgb.double().numpy() - exact).mean(-1)
     return {"depth_error": float(depth.mean()), "color_error": float(color.mean())}
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from random_scenes import CUBE, Scene, dense_grad, gradients_of, of_slots, random_scene, samples_of
+from random_scenes import CUBE, Scene, dense_grad, gradients_of, of_rays, random_scene, samples_of
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch, interpolate, variation
@@ -70,13 +70,13 @@ def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
 def marched(s: Scene, name: str, exact: Scene) -> list[Check]:
     """What the march itself says: optical depths, and which samples it keeps at a threshold."""
     threshold, expected = 0.02, exact.render()
-    depth, weights = of_slots(s.render(), "tau").sum(-1), expected.composite.weights
-    actual = s.render(threshold)
-    kept = of_slots(actual, "valid").sum(-1).cpu()
-    least, most = ((weights > threshold * (1 + sign * 1e-3)).sum(-1) for sign in (1, -1))
-    lost = torch.where(weights <= threshold, weights, 0).sum(-1)
+    depths = (torch.stack([x.sum() for x in of_rays(r, r.samples.tau)]) for r in (s.render(), expected))
+    actual, weights = s.render(threshold), of_rays(expected, expected.composite.weights)
+    kept = actual.samples.starts.diff().cpu()
+    least, most = (torch.stack([(w > threshold * (1 + sign * 1e-3)).sum() for w in weights]) for sign in (1, -1))
+    lost = torch.stack([w[w <= threshold].sum() for w in weights])
     return [
-        Check(f"{name}: optical depths by the march", _relative(depth, of_slots(expected, "tau").sum(-1)), 1e-4),
+        Check(f"{name}: optical depths by the march", _relative(*depths), 1e-4),
         Check(f"{name}: rays that keep other samples than they should", int(((kept < least) | (kept > most)).sum()), 0),
         Check(f"{name}: mass of what is dropped", _relative(actual.samples.dropped_mass[:, 0], lost), 1e-2),
     ]

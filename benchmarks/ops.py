@@ -125,13 +125,19 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
 
     samples = sample()
     lookup = field._lookup(bundle, samples)
-    (num_rays, slots), intersected, kept = lookup.shape, float(samples.num_intersected.sum()), float(len(lookup.index))
-    channels, rows, taps = field.feature_channels, float(len(lookup.rows)), lookup.taps[0]
-    counts = {"rays": num_rays, "intersected": intersected, "kept": kept, "rows": rows, "pixels": len(batch["indices"])}
-    kept_bytes = 2 * 4 + 3 * 4 + 3 * 4 + 1  # head and plane, position, distance and depths, whether valid
+    intersected, kept = float(samples.num_intersected.sum()), float(len(samples.heads))
+    channels, rows, taps = field.feature_channels, float(len(lookup.rows)), lookup.taps
+    counts = {
+        "rays": len(bundle),
+        "intersected": intersected,
+        "kept": kept,
+        "rows": rows,
+        "pixels": len(batch["indices"]),
+    }
+    kept_bytes = 2 * 8 + 3 * 4 + 3 * 4  # head and plane, position, distance and depths
     ops = [
         Op("march: look up, merge, keep", sample, intersected * 4 * 4 + kept * kept_bytes),
-        _sort(samples.num_intersected, slots),
+        _sort(samples.num_intersected),
         _index(lookup.rows[taps.positions], len(field.density), rows),
     ]
     ops += _interpolation(field, lookup, channels)
@@ -141,12 +147,12 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
     return ops, counts
 
 
-def _sort(intersected: Tensor, slots: int) -> Op:
+def _sort(intersected: Tensor) -> Op:
     """Merging by one stable sort, as the plain path does (the compiled march merges as it goes)."""
-    count, width = int(intersected.sum()), int(intersected.max())
+    count = int(intersected.sum())
     rays = torch.repeat_interleave(torch.arange(len(intersected), device=intersected.device), intersected)
-    keys = torch.rand(count, generator=torch.Generator().manual_seed(slots)).to(intersected.device)
-    return Op("merge by a sort", lambda: merge(rays, keys, intersected), count * (8 + 4) + len(intersected) * width * 9)
+    keys = torch.rand(count, generator=torch.Generator().manual_seed(0)).to(intersected.device)
+    return Op("merge by a sort", lambda: merge(rays, keys), count * (8 + 4 + 8))
 
 
 def _index(rows: Tensor, table_rows: int, distinct: float) -> Op:
@@ -155,7 +161,7 @@ def _index(rows: Tensor, table_rows: int, distinct: float) -> Op:
 
 def _interpolation(field: Any, lookup: Lookup, channels: int) -> list[Op]:
     """Features of the kept samples from the distinct rows, and back."""
-    position, weights, rows = lookup.taps[0].positions, lookup.taps[0].weights, lookup.rows
+    position, weights, rows = lookup.taps.positions, lookup.taps.weights, lookup.rows
     table, features = len(rows) * channels * 4, lookup.features.detach()
     moved = position.numel() * (position.element_size() + 4) + table + len(position) * channels * 4
     grad = torch.rand(len(position), channels, device=weights.device)
@@ -168,13 +174,13 @@ def _interpolation(field: Any, lookup: Lookup, channels: int) -> list[Op]:
 
 def _shading(field: Any, rays: Any, samples: MergedSamples, lookup: Lookup) -> list[Op]:
     """Weights of the samples, and what rays show by them: forwards, and back to texels and depths."""
-    valid, skipped = samples.valid, (samples.skipped_before, samples.skipped_total)
+    of_rays = (samples.starts, samples.skipped_before, samples.skipped_total)
     tau, features = samples.tau.clone().requires_grad_(), lookup.features.detach().requires_grad_()
     lookup = replace(lookup, density=lookup.density.detach(), features=features)
-    fixed = composite_weights(tau.detach(), valid, *skipped)
+    fixed = composite_weights(tau.detach(), *of_rays)
 
     def weigh() -> Tensor:
-        return composite_weights(tau, valid, *skipped).weights
+        return composite_weights(tau, *of_rays).weights
 
     def show() -> Tensor:
         return field.render_colors(rays, samples, lookup, fixed)[0]
@@ -183,9 +189,9 @@ def _shading(field: Any, rays: Any, samples: MergedSamples, lookup: Lookup) -> l
         work().sum().backward()
         tau.grad = features.grad = field.networks.weights.grad = None
 
-    asked = len(valid) if field.shading == "ray" else len(lookup.index)
+    asked = len(rays) if field.shading == "ray" else len(tau)
     sums = 2.0 * sum(math.prod(s) for s in field.networks.shapes[::2]) * asked
-    depths, read = valid.numel() * (4 + 4 + 1 + 4), features.numel() * 4 + len(lookup.index) * 4 * (4 + 4)
+    depths, read = len(tau) * (4 + 4 + 4), features.numel() * 4 + len(tau) * 4 * (4 + 4)
     return [
         Op("compositing", weigh, depths),
         Op("compositing, and backward", partial(back, weigh), 2 * depths),

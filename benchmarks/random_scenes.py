@@ -49,9 +49,9 @@ def render(
     return render_rays(rays, field, MarchOptions(threshold, blends=blends), **sampling)
 
 
-def of_slots(rendered: RenderedRays, name: str) -> Tensor:
-    """Data of each sample [R, S], by its name in ``MergedSamples``."""
-    return getattr(rendered.samples, name)
+def of_rays(rendered: RenderedRays, values: Tensor) -> list[Tensor]:
+    """Values of the samples of each ray."""
+    return list(values.split(rendered.samples.starts.diff().tolist()))
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ class Scene:
 
 def samples_of(rendered: RenderedRays) -> tuple[list[list[tuple[int, int]]], list[Tensor]]:
     """Of each ray the (head, plane) of its samples, nearest first, and their optical depths."""
-    valid, heads, planes, tau = (of_slots(rendered, name).cpu() for name in ("valid", "heads", "planes", "tau"))
-    pairs = [list(zip(h[v].tolist(), p[v].tolist(), strict=True)) for h, p, v in zip(heads, planes, valid, strict=True)]
-    return pairs, [t[v] for t, v in zip(tau, valid, strict=True)]
+    samples = rendered.samples
+    heads, planes, tau = (of_rays(rendered, x.cpu()) for x in (samples.heads, samples.planes, samples.tau))
+    return [list(zip(h.tolist(), p.tolist(), strict=True)) for h, p in zip(heads, planes, strict=True)], tau
 
 
 def dense_grad(table: Table) -> Tensor | None:

@@ -70,8 +70,8 @@ def draw_reliability(path: Path) -> None:
     share, rest = blend_shares(reliability, torch.ones_like(reliability, dtype=torch.bool), own)
     weights = []
     for depth in (tau, blended_optical_depth(tau, share, rest)):
-        every, none = torch.ones(1, len(depth), dtype=torch.bool), torch.zeros(1, len(depth), dtype=torch.float64)
-        weights.append(composite_weights(depth[None], every, none, none[:, :1]).weights[0].reshape(-1, 2).numpy())
+        starts, none = torch.tensor([0, len(depth)]), torch.zeros_like(depth)
+        weights.append(composite_weights(depth, starts, none, none[:1, None]).weights.reshape(-1, 2).numpy())
     figure = _figure(9.5, 5.6)
     light = [100 * w[t < 8.3].sum() / w.sum() for w in weights]
     rows = [

@@ -261,7 +261,7 @@ class MMPIModel(Model):
         held = self.decay if dispatch.on_gpu(self.decay) else decay
         total, errors = batch_losses(rays, self.field, image, self.config.loss, g, step, held)
         if rays.lookup is not None and self.progress.schedule.watches(step):
-            self.field.note_use(rays.lookup, rays.composite.weights, rays.samples.num_intersected, errors)
+            self.field.note_use(rays.lookup, rays.samples, rays.composite.weights, errors)
         self.camera_optimizer.get_loss_dict(total)
         # A batch of rays that meet nothing trainable would have no gradient; this adds 0 with a gradient.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()
@@ -269,7 +269,7 @@ class MMPIModel(Model):
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Any]:
         samples = outputs["training"].samples
-        intersected, kept = samples.num_intersected.float().mean(), samples.valid.sum(-1).float().mean()
+        intersected, kept = samples.num_intersected.float().mean(), samples.starts.diff().float().mean()
         counts = {"intersected_samples": intersected, "kept_samples": kept, "dropped_mass": samples.dropped_mass.mean()}
         self.camera_optimizer.get_metrics_dict(counts)
         return counts

@@ -16,13 +16,22 @@ import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
+from torch.nn.functional import pad
 
 from mmpi_ns.blending import blended_optical_depth, log_shares
 from mmpi_ns.heads import heads_of
-from mmpi_ns.ops.composite import composite_weights, exclusive_cumsum, median_inverse_distance, winning_heads
+from mmpi_ns.ops.composite import (
+    composite_weights,
+    median_inverse_distance,
+    ray_numbers,
+    sum_before,
+    sum_by_ray,
+    winning_heads,
+)
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
-from mmpi_ns.ops.gather import gather_places
+from mmpi_ns.ops.gather import Taps, gather_taps
+from mmpi_ns.ops.interpolate import texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MarchOptions, MergedSamples, RayOutputs, Rays, march_on_cpu, render_fused_on_cpu
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, plane_hits, sample_disparity
@@ -78,7 +87,7 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     first, counts, fully_covered = crossings(layout, rays, hits)
     flat = _intersected_samples(layout, tables, rays, hits, first, counts)
     per_ray = counts.sum(-1)
-    order, valid = merge(flat.rays, flat.inverse_t, per_ray)
+    order, starts = merge(flat.rays, flat.inverse_t), pad(per_ray.cumsum(0), (1, 0))
     tau = flat.tau
     if options.blends and tau.numel():
         local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
@@ -86,11 +95,10 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
         # Front to back until the transmittance of a ray is below exp(-OPAQUE_DEPTH). Reliability costs a lookup in
         # every head, and most samples lie behind the first surface: those keep their unblended depth, which changes
         # weights by less than that. Samples too thin to matter get an equal share without one.
-        passed = tau.new_zeros(order.shape[0])
-        for start in range(0, order.shape[1], BLEND_BLOCK):
-            block = order[:, start : start + BLEND_BLOCK]
-            visible = valid[:, start : start + BLEND_BLOCK] & (passed < OPAQUE_DEPTH)[:, None]
-            index = block[visible]
+        passed, numbers = tau.new_zeros(len(per_ray)), flat.rays[order]
+        blocks = (torch.arange(len(order), device=order.device) - starts[numbers]) // BLEND_BLOCK
+        for block in range(int(blocks.max()) + 1):
+            index = order[(blocks == block) & (passed < OPAQUE_DEPTH)[numbers]]
             if not index.numel():
                 break
             depth = flat.tau[index]
@@ -100,13 +108,11 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
             shares = log_shares(layout, tables.reliability, tables.touched, *places)
             blended = blended_optical_depth(depth[thick], *shares)
             tau[index] = (depth / layout.num_heads).index_copy(0, thick, blended)
-            passed += torch.where(visible, tau[block], 0.0).sum(-1)
-    order, valid, *skipped = prune(order, valid, tau, options.threshold, options.fair_share)
-    order = torch.where(valid, order, len(tau))  # empty slots take the zeros behind the samples
+            passed.index_add_(0, flat.rays[index], tau[index])
+    kept, before, starts, total, mass = prune(tau[order], starts, options.threshold, options.fair_share)
     columns = (flat.heads, flat.planes, flat.ndc, flat.inverse_t, tau)
-    heads, planes, ndc, inverse_t, tau = (torch.cat([x, x.new_zeros(1, *x.shape[1:])])[order] for x in columns)
-    before, total, mass = skipped
-    return MergedSamples(heads, planes, ndc, inverse_t, tau, before, valid, total, mass, per_ray, fully_covered)
+    heads, planes, ndc, inverse_t, tau = (x[order[kept]] for x in columns)
+    return MergedSamples(heads, planes, ndc, inverse_t, tau, before, starts, total, mass, per_ray, fully_covered)
 
 
 @operation("gpu", kernels="mmpi_ns.ops.march")
@@ -126,15 +132,16 @@ def render_fused(
         options: which samples are kept, and how they are blended.
     """
     m = march(layout, tables, rays, options)
-    composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)
-    sums = gather_places(layout, features, m.places, composite.weights)
+    composite = composite_weights(m.tau, m.starts, m.skipped_before, m.skipped_total)
+    texels = Taps(*texel_rows(layout, m.heads, m.planes, m.ndc))
+    sums = gather_taps(features, texels, m.starts, composite.weights)
     return RayOutputs(
         gathered=sums.gathered,
-        mass=composite.weights.sum(-1, keepdim=True),
+        mass=sums.mass,
         transmittance=composite.transmittance,
         accumulation=composite.accumulation,
-        inverse_t=median_inverse_distance(composite.weights, m.inverse_t, m.valid),
-        winner=winning_heads(composite.weights, m.heads, layout.num_heads),
+        inverse_t=median_inverse_distance(composite.weights, m.inverse_t, m.starts),
+        winner=winning_heads(composite.weights, m.heads, m.starts, layout.num_heads),
         dropped_mass=m.dropped_mass,
     )
 
@@ -206,62 +213,51 @@ def _intersected_samples(
 # Merge ---------------------------------------------------------------------------------------------------------------
 
 
-def merge(
-    rays: Int[Tensor, "N"], inverse_t: Float[Tensor, "N"], counts: Int[Tensor, "R"]
-) -> tuple[Int[Tensor, "R S"], Bool[Tensor, "R S"]]:
-    """Sort flat samples along their rays, nearest first.
+def merge(rays: Int[Tensor, "N"], inverse_t: Float[Tensor, "N"]) -> Int[Tensor, "N"]:
+    """Indices of samples by ray, and along each ray nearest first.
 
     Ties keep the order of the list, which runs over (head, plane), so the result does not depend on the batch.
 
     Args:
-        rays: ray of each flat sample.
-        inverse_t: inverse distance of each flat sample.
-        counts: samples of each ray; S = counts.max().
-
-    Returns:
-        Index of each slot's sample in the flat list (0 in empty slots), and mask of the occupied slots.
+        rays: ray of each sample.
+        inverse_t: inverse distance of each sample.
     """
-    by_ray, width = torch.argsort(rays, stable=True), max(1, int(counts.max())) if counts.numel() else 1
-    valid = torch.arange(width, device=rays.device) < counts[:, None]
-    index, keys = torch.zeros_like(valid, dtype=torch.int64), torch.full_like(valid, -1.0, dtype=inverse_t.dtype)
-    index[valid], keys[valid] = by_ray, inverse_t[by_ray]
-    _, nearest = torch.sort(keys, dim=-1, descending=True, stable=True)
-    return index.gather(-1, nearest), valid
+    nearest = torch.argsort(inverse_t, descending=True, stable=True)
+    return nearest[torch.argsort(rays[nearest], stable=True)]
 
 
 # Prune ---------------------------------------------------------------------------------------------------------------
 
 
 def prune(
-    order: Int[Tensor, "R S"], valid: Bool[Tensor, "R S"], tau: Float[Tensor, "N"], threshold: float, fair_share: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    tau: Float[Tensor, "N"], starts: Int[Tensor, "R+1"], threshold: float, fair_share: float
+) -> tuple[Int[Tensor, "K"], Tensor, Tensor, Tensor, Tensor]:
     """Keep the samples whose weight exceeds min(threshold, fair_share / samples on the ray).
 
     The second bound matters at the start, when all weights are 1/L: a fixed threshold would keep nothing, and samples
     that are not kept cannot learn.
 
     Args:
-        order: all samples, nearest first (see ``merge``).
-        valid: mask of the occupied slots.
-        tau: blended optical depth of the flat samples.
+        tau: blended optical depth of all merged samples.
+        starts: of the rays' samples.
         threshold: weight below which a sample is dropped once the field has sharpened; 0 keeps all.
         fair_share: the bound relative to equal weights; inf for the threshold alone.
 
     Returns:
-        ``order`` and ``valid`` of the kept samples, packed to the left, and ``skipped_before``, ``skipped_total`` and
-        ``dropped_mass`` of ``MergedSamples``.
+        Indices of the kept samples, and ``skipped_before``, ``starts``, ``skipped_total`` and ``dropped_mass`` of
+        ``MergedSamples``.
     """
-    depth = torch.where(valid, tau[order] if tau.numel() else 0.0, 0.0)
-    weights = torch.exp(-exclusive_cumsum(depth)) * -torch.expm1(-depth)
-    bound = (fair_share / valid.sum(-1, keepdim=True).clamp(min=1)).clamp(max=threshold)
-    kept = valid & (weights > bound) if threshold > 0 else valid
-    skipped = torch.where(kept, 0.0, depth)
-    width = max(1, int(kept.sum(-1).max())) if kept.numel() else 1
-    packed = torch.argsort((~kept).to(torch.int8), dim=-1, stable=True)[:, :width]
-    there = kept.gather(-1, packed)
-    before = torch.where(there, exclusive_cumsum(skipped).gather(-1, packed), 0.0)
-    mass = torch.where(kept, 0.0, weights).sum(-1, keepdim=True)
-    return order.gather(-1, packed), there, before, skipped.sum(-1, keepdim=True), mass
+    numbers = ray_numbers(starts, len(tau))
+    weights = torch.exp(-sum_before(tau, starts, numbers)).to(tau.dtype) * -torch.expm1(-tau)
+    bound = (fair_share / starts.diff().clamp(min=1)).clamp(max=threshold)
+    kept = weights > bound[numbers] if threshold > 0 else torch.ones_like(weights, dtype=torch.bool)
+    skipped, index = torch.where(kept, 0.0, tau), kept.nonzero()[:, 0]
+    before = sum_before(skipped, starts, numbers)[index].to(tau.dtype)
+    total, mass = (
+        sum_by_ray(x.double()[:, None], starts, numbers).to(tau.dtype)
+        for x in (skipped, torch.where(kept, 0.0, weights))
+    )
+    return index, before, pad(kept.cumsum(0), (1, 0))[starts], total, mass
 
 
 march.on_cpu(march_on_cpu)

@@ -108,6 +108,11 @@ def median_reprojection_error(observations):
 # Blending ------------------------------------------------------------------------------------------------------------
 
 
+def starts_of(valid):
+    """Where the samples of each ray start, of a mask [R, S] of those that there are."""
+    return torch.nn.functional.pad(valid.sum(-1).cumsum(0), (1, 0))
+
+
 def tensor(values, dtype=torch.float64):
     return torch.tensor(np.asarray(values), dtype=dtype)
 

@@ -58,8 +58,7 @@ def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:
     leaves = [
         c.requires_grad_() for c, x in zip(copies, arguments, strict=True) if isinstance(x, Tensor) and x.requires_grad
     ]
-    taps = [t for x in copies if isinstance(x, list) for t in x if isinstance(t, Taps)]
-    leaves += [t.weights for t in taps if t.weights.requires_grad]
+    leaves += [x.weights for x in copies if isinstance(x, Taps) and x.weights.requires_grad]
     with torch.set_grad_enabled(bool(leaves)):
         results = dispatch.function(name, form)(*copies)
     numbers = [*dispatch.tensors_in(vars(results).values() if is_dataclass(results) else [results])]
@@ -122,17 +121,18 @@ def _variations(device: str, shapes: Shapes) -> list[tuple]:
 
 
 def _gathers(device: str, shapes: Shapes) -> list[tuple]:
-    """Samples with known texels, of planes and of both planes and the cube, that move and that do not; texels with
-    gradients and without."""
-    weights, chosen = 0.1 * _random(device, RAYS, 4), torch.arange(RAYS, device=device) % 5 > 0
-    cases, both = [], (4, 8)
-    for sizes, learns, moves in (((4,), True, False), (both, False, False), (both, True, False), (both, True, True)):
-        shares = [(_random(device, RAYS, n) / n).requires_grad_(moves) for n in sizes]
+    """Samples with known texels, without and with a cube, that move and that do not, and three that belong to no ray;
+    texels with gradients and without."""
+    counts, chosen = torch.arange(RAYS, device=device) % 4, torch.arange(RAYS, device=device) % 5 > 0
+    starts, cases = torch.nn.functional.pad(counts.cumsum(0), (1, 0)), []
+    count = int(starts[-1]) + 3
+    for taps, learns, moves in ((4, True, False), (8, False, False), (8, True, False), (8, True, True)):
+        shares = (_random(device, count, taps) / taps).requires_grad_(moves)
         # Some rows of the table, many of them several times.
-        taps = [Taps((_random(device, *x.shape) * (ROWS // 3)).int() * 3, x) for x in shares]
-        slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(len(sizes))])
+        rows = (_random(device, count, taps) * (ROWS // 3)).int() * 3
         values = (2 * _random(device, ROWS, shapes.channels) - 1).requires_grad_(learns)
-        cases.append((values, taps, slots, weights.clone().requires_grad_(), chosen))
+        weights = (0.1 * _random(device, count)).requires_grad_()
+        cases.append((values, Taps(rows, shares), starts, weights, None if learns and not moves else chosen))
     return cases
 
 

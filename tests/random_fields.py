@@ -12,6 +12,7 @@ import pytest
 import torch
 from hand_made import random_mpi, unit
 from random_scenes import bundle_of as bundle
+from random_scenes import of_rays
 
 from mmpi_ns.blending import blended_optical_depth
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -76,11 +77,11 @@ def render(field, rays, threshold=0.0, blends=False, **chosen):
     """March, field and compositing, put together as the model does."""
     _, samples = sampled(field, rays, threshold, blends, **chosen)
     tau, lookup = field.optical_depths(rays, samples)
-    if blends and lookup.index.numel():
-        flat = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(rays, samples, lookup))
-        tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
-    composite = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
-    return Rendered(samples, composite, render_colors(composite, field.sample_colors(rays, samples, lookup)))
+    if blends and tau.numel():
+        tau = blended_optical_depth(tau, *field.sample_shares(rays, samples))
+    composite = composite_weights(tau, samples.starts, samples.skipped_before, samples.skipped_total)
+    colors = field.sample_colors(rays, samples, lookup)
+    return Rendered(samples, composite, render_colors(composite, colors, samples.starts))
 
 
 # The same by loops in float64 -----------------------------------------------------------------------------------------
@@ -203,7 +204,8 @@ CLEAR = 2e-5
 def compare(field, origins, directions, blends=False, heads_of=None, near=0.05, far=math.inf, error=ERROR, **chosen):
     """Renders all rays at once and each by the oracle; returns the number of clear rays that met something."""
     actual = render(field, bundle(origins, directions, near, far), blends=blends, **chosen)
-    met = 0
+    columns = (getattr(actual.samples, name) for name in ("heads", "planes", "inverse_t"))
+    samples, met = [of_rays(actual, x) for x in (*columns, actual.composite.weights)], 0
     for i in range(len(origins)):
         ray = OracleRay(field, origins[i], directions[i], near, far)
         if ray.margin < CLEAR:
@@ -211,13 +213,11 @@ def compare(field, origins, directions, blends=False, heads_of=None, near=0.05, 
         wanted = ray.render(blends, heads_of(i, ray) if heads_of else None)
         count = len(wanted.samples)
         assert actual.samples.num_intersected[i] == count
-        valid = actual.samples.valid[i]
-        assert valid.sum() == count and valid[:count].all()
-        assert actual.samples.heads[i, :count].tolist() == [s.head for s in wanted.samples]
-        assert actual.samples.planes[i, :count].tolist() == [s.plane for s in wanted.samples]
-        inverse_t = actual.samples.inverse_t[i, :count].tolist()
-        assert inverse_t == pytest.approx([s.inverse_t for s in wanted.samples], rel=1e-4, abs=1e-6)
-        assert np.abs(actual.composite.weights[i, :count].numpy() - wanted.weights).max(initial=0) < error
+        heads, planes, inverse_t, weights = (x[i] for x in samples)
+        assert heads.tolist() == [s.head for s in wanted.samples]
+        assert planes.tolist() == [s.plane for s in wanted.samples]
+        assert inverse_t.tolist() == pytest.approx([s.inverse_t for s in wanted.samples], rel=1e-4, abs=1e-6)
+        assert np.abs(weights.numpy() - wanted.weights).max(initial=0) < error
         assert np.abs(actual.rgb[i].numpy() - wanted.color).max() < error
         assert abs(actual.composite.transmittance[i].item() - wanted.transmittance) < error
         met += count > 0

@@ -6,11 +6,10 @@ Its tables are in ``tables.py``.
 from __future__ import annotations
 
 import math
-from itertools import accumulate
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
@@ -19,10 +18,9 @@ from mmpi_ns.blending import head_shares, log_shares
 from mmpi_ns.field.shading import ColorNetworks, RayShader
 from mmpi_ns.field.tables import Lookup, TexelTables
 from mmpi_ns.heads import heads_of
-from mmpi_ns.ops.composite import Composite, render_colors
-from mmpi_ns.ops.dispatch import on_gpu
-from mmpi_ns.ops.gather import RaySums, Taps, activate, gather_places, gather_taps
-from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
+from mmpi_ns.ops.composite import Composite, ray_numbers, render_colors, sum_by_ray
+from mmpi_ns.ops.gather import RaySums, Taps, activate, gather_taps
+from mmpi_ns.ops.interpolate import index_rows, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MergedSamples
 from mmpi_ns.ops.variation import total_variation
@@ -189,8 +187,8 @@ class MMPIField(TexelTables):
 
     # Merged samples ----------------------------------------------------------------------------------------------
 
-    def optical_depths(self, rays: RayBundle, samples: MergedSamples) -> tuple[Float[Tensor, "R S"], Lookup]:
-        """Optical depth of each valid sample (0 in empty slots), and the lookups.
+    def optical_depths(self, rays: RayBundle, samples: MergedSamples) -> tuple[Float[Tensor, "N"], Lookup]:
+        """Optical depth of each sample, and the lookups.
 
         A density times an interval: on a plane there is no interval, so the product itself is learned.
         """
@@ -198,38 +196,20 @@ class MMPIField(TexelTables):
         if self.training and self.marks_texels:
             self.touched.index_fill_(0, lookup.rows, 1)
             self.touched[:BRICK].zero_()
-        raw = lookup.by_head(lookup.read(lookup.density)[:, 0])
-        tau = [self.layout.optical_depth(k, part, lookup.planes[here]) for k, here, part in raw]
-        out = lookup.ndc.new_zeros(lookup.shape.numel())
-        if tau:
-            out = out.index_copy(0, lookup.index, torch.cat(tau))
-        return out.view(lookup.shape), lookup
+        raw = lookup.read(lookup.density)[:, 0]
+        return self.layout.optical_depth(samples.heads, raw, samples.planes), lookup
 
     def _lookup(self, rays: RayBundle, samples: MergedSamples) -> Lookup:
-        room = samples.capacity
-        index, heads, planes, ndc, counts = order_by_head(
-            samples.places, len(self.grids), samples.head_counts, room is not None
-        )
+        room, ndc = samples.capacity, samples.ndc
         if rays.origins.requires_grad or rays.directions.requires_grad:
-            of_rays, inverse_t = index // samples.valid.shape[1], samples.inverse_t.reshape(-1)[index]
-            ndc = moving(self.layout, rays.origins, rays.directions, of_rays, heads, planes, inverse_t, ndc)
-        spans = [(k, slice(end - n, end)) for k, (n, end) in enumerate(zip(counts, accumulate(counts))) if n]  # noqa: B905
-        in_mpis, parts = sum(counts[: len(self.plan.mpis)]), []
-        if in_mpis:
-            parts.append(texel_rows(self.layout, heads[:in_mpis], planes[:in_mpis], ndc[:in_mpis]))
-        if in_mpis < len(index):
-            parts.append(self.grids[-1].trilinear(ndc[in_mpis:]))
-        if room is not None:  # unused slots read the empty brick
-            filled = samples.valid.reshape(-1)[index].split([len(rows) for rows, _ in parts])
-            empty = torch.arange(len(index), device=index.device).remainder(BRICK).split([len(x) for x in filled])
-            columns = zip(filled, parts, empty, strict=True)
-            parts = [(torch.where(here[:, None], rows, none[:, None]), w) for here, (rows, w), none in columns]
-        rows = [rows.reshape(-1) for rows, _ in parts] or [heads]
-        distinct = index_rows(torch.cat(rows), len(self.density), most=None if room is None else room.rows)
-        positions = distinct.positions.split([len(r) for r in rows])
-        taps = [Taps(p.view(w.shape), w) for p, (_, w) in zip(positions, parts)]  # noqa: B905
+            ndc = moving(self.layout, rays.origins, rays.directions, samples)
+        rows, weights = texel_rows(self.layout, samples.heads, samples.planes, ndc)
+        if room is not None:  # behind the last ray, the empty brick is read
+            index = torch.arange(len(rows), device=rows.device)[:, None]
+            rows = torch.where(index < samples.starts[-1], rows, index % BRICK)
+        distinct = index_rows(rows, len(self.density), most=None if room is None else room.rows)
         read = (distinct.unique, *(read_rows(table, distinct.unique) for table in (self.density, self.features)))
-        return Lookup(samples.valid.shape, index, heads, planes, ndc, spans, taps, *read, distinct=distinct.count)
+        return Lookup(ndc, Taps(distinct.positions, weights), *read, distinct=distinct.count)
 
     def sample_colors(
         self,
@@ -237,8 +217,8 @@ class MMPIField(TexelTables):
         samples: MergedSamples,
         lookup: Lookup | None = None,
         chosen: Bool[Tensor, "R"] | None = None,
-    ) -> Float[Tensor, "R S 3"]:
-        """Colours of the valid samples by a network for each, black in empty slots.
+    ) -> Float[Tensor, "N 3"]:
+        """Colours of the samples by a network for each, black on rays that are not chosen.
 
         Args:
             rays: of the samples.
@@ -252,19 +232,16 @@ class MMPIField(TexelTables):
         if self.layout.cube is not None:
             axes = torch.cat([axes, torch.eye(3, device=axes.device)[None]])
         lookup = lookup or self._lookup(rays, samples)
-        out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
-        colors, slots = [out[:0]], [lookup.index[:0]]
-        for k, here, part in lookup.by_head(lookup.read(lookup.features)):
-            index = lookup.index[here]
-            of_samples = (part, lookup.ndc[here], index // lookup.shape[1], index)
-            if chosen is not None and not on_gpu(chosen):  # a GPU would synchronise
-                kept = chosen[of_samples[2]].nonzero()[:, 0]
-                of_samples = tuple(x.index_select(0, kept) for x in of_samples)
-            values, ndc, numbers, index = of_samples
-            in_axes = geometry.rotate(axes[k], directions)
-            colors.append(self.networks.shade(networks[k], values, ndc, in_axes, numbers))
-            slots.append(index)
-        return out.index_copy(0, torch.cat(slots), torch.cat(colors)).view(*lookup.shape, 3)
+        parts = samples.by_head(len(self.grids), chosen)
+        index, sizes = torch.cat(parts), [len(x) for x in parts]
+        columns = (lookup.read(lookup.features), lookup.ndc, samples.rays)
+        # Split, not sliced: the gradient of a slice is as large as the whole.
+        of_heads = (x.index_select(0, index.clamp(max=max(0, len(x) - 1))).split(sizes) for x in columns)
+        colors = [
+            self.networks.shade(networks[k], values, ndc, geometry.rotate(axes[k], directions), numbers)
+            for k, (values, ndc, numbers) in enumerate(zip(*of_heads, strict=True))
+        ]
+        return lookup.ndc.new_zeros(len(lookup.ndc) + 1, 3).index_copy(0, index, torch.cat(colors))[:-1]
 
     def render_colors(
         self,
@@ -283,18 +260,19 @@ class MMPIField(TexelTables):
             composite: weights of the samples.
             chosen: rays whose colours are needed; others may be skipped. None for all.
         """
+        starts = samples.starts
         if not isinstance(self.networks, RayShader):
-            colors, weights = self.sample_colors(rays, samples, lookup, chosen), composite.weights.detach()[..., None]
-            rgb, first = render_colors(composite, colors), (weights * colors).sum(1)
-            return rgb, RaySums(first, weights.sum(1), first, (weights * colors**2).sum(1))
+            colors, weights = self.sample_colors(rays, samples, lookup, chosen), composite.weights.detach()[:, None]
+            values = torch.cat([weights, weights * colors, weights * colors**2], -1)
+            sums = sum_by_ray(values, starts, ray_numbers(starts, len(values)))
+            mass, first, second = sums.split([1, 3, 3], -1)
+            return render_colors(composite, colors, starts), RaySums(first, mass, first, second)
         if lookup is None:
-            sums = gather_places(self.layout, self.features.data, samples.places, composite.weights)
+            texels = Taps(*texel_rows(self.layout, samples.heads, samples.planes, samples.ndc))
+            sums = gather_taps(self.features.data, texels, starts, composite.weights)
         else:
-            if chosen is None:
-                chosen = torch.ones(lookup.shape[0], dtype=torch.bool, device=lookup.rows.device)
-            sums = gather_taps(lookup.features, lookup.taps, lookup.index, composite.weights, chosen)
-        mass = composite.weights.sum(-1, keepdim=True)
-        return self.networks.shade(sums.gathered, mass, composite.accumulation, rays.directions), sums
+            sums = gather_taps(lookup.features, lookup.taps, starts, composite.weights, chosen)
+        return self.networks.shade(sums.gathered, composite.mass, composite.accumulation, rays.directions), sums
 
     def total_variation(
         self, lookup: Lookup, density_weight: float, feature_weight: float, chroma_times: float = 0.0
@@ -322,11 +300,11 @@ class MMPIField(TexelTables):
                 total = total + weight * term
         return total
 
-    def sample_shares(self, rays: RayBundle, samples: MergedSamples, lookup: Lookup) -> tuple[Tensor, Tensor]:
-        """log P and log(1 - P) of the valid samples of rays, with gradients to the reliability."""
+    def sample_shares(self, rays: RayBundle, samples: MergedSamples) -> tuple[Tensor, Tensor]:
+        """log P and log(1 - P) of the samples of rays, with gradients to the reliability."""
         # Shares have no gradients to poses.
         local = geometry.LocalRays.of(rays.origins.detach(), rays.directions.detach(), self.layout.frames)
-        places = (lookup.index // lookup.shape[1], local, samples.inverse_t.reshape(-1)[lookup.index], lookup.heads)
+        places = (samples.rays, local, samples.inverse_t, samples.heads)
         return log_shares(self.layout, self.reliability, self.touched, *places)
 
 
@@ -334,11 +312,7 @@ def moving(
     layout: SceneLayout,
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
-    rays: Int[Tensor, "N"],
-    heads: Int[Tensor, "N"],
-    planes: Int[Tensor, "N"],
-    inverse_t: Float[Tensor, "N"],
-    ndc: Float[Tensor, "N 3"],
+    samples: MergedSamples,
 ) -> Float[Tensor, "N 3"]:
     """The positions of samples, bit for bit unchanged, with gradients to the rays.
 
@@ -350,27 +324,22 @@ def moving(
         layout: of the scene.
         origins: of the rays, world axes.
         directions: likewise, unit.
-        rays: ray of each sample.
-        heads: of each sample, ascending; those of the cube come last.
-        planes: of each sample.
-        inverse_t: inverse distances of the samples.
-        ndc: their positions.
+        samples: of the rays.
     """
-    count = len(heads) if layout.cube is None else int(torch.searchsorted(heads, len(layout.mpis)))
-    frames, mpis = layout.frames, heads[:count]
+    frames, in_cube, rays = layout.frames, samples.heads == len(layout.mpis), samples.rays
+    mpis = torch.where(in_cube, 0, samples.heads)
     local = LocalRays.of(origins, directions, frames)
     o, d = local.local_origins, local.local_directions
     facing = d[..., 2:] > FACING_EPS  # elsewhere there are no samples
     slope = d[..., :2] / torch.where(facing, d[..., 2:], 1)
     bend = o[..., :2] - o[..., 2:] * slope
-    line = torch.cat([slope, bend], -1).flatten(0, 1).index_select(0, rays[:count] * len(layout.mpis) + mpis)
-    m = frames.num_planes[mpis] - 1 - planes[:count]
+    line = torch.cat([slope, bend], -1).flatten(0, 1).index_select(0, rays * len(layout.mpis) + mpis)
+    m = frames.num_planes[mpis] - 1 - samples.planes
     w = sample_disparity(m, frames.disparity_steps[mpis], frames.last_disparities[mpis])[:, None]
     size = (frames.extents[:, 1::2] - frames.extents[:, ::2])[mpis]
     # NDC (u, v, .) up to a constant.
-    parts = [torch.nn.functional.pad((line[:, :2] + w * line[:, 2:]) * (2 / size), (0, 1))]
+    moved = torch.nn.functional.pad((line[:, :2] + w * line[:, 2:]) * (2 / size), (0, 1))
     if layout.cube is not None:
-        in_cube = rays[count:]
-        parts.append(layout.cube.normalised(origins[in_cube] + directions[in_cube] / inverse_t[count:, None]))
-    moved = torch.cat(parts)
-    return ndc + (moved - moved.detach())
+        t = 1 / torch.where(in_cube, samples.inverse_t, 1.0)[:, None]
+        moved = torch.where(in_cube[:, None], layout.cube.normalised(origins[rays] + directions[rays] * t), moved)
+    return samples.ndc + (moved - moved.detach())

@@ -6,7 +6,7 @@ which nerfstudio fixes before K is known. Row arithmetic is in ``texels.py``, wo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import Table, weigh_rows
+from mmpi_ns.ops.march import MergedSamples
 from mmpi_ns.scene.bricks import grown_tiles, move_bricks, new_table, resample, tiles_with_copies
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
@@ -39,23 +40,16 @@ ENOUGH_CROSSINGS = 32
 
 @dataclass(frozen=True)
 class Lookup:
-    """Lookups of the valid samples of a merged batch in the tables. Samples are ordered by head, then by slot.
+    """Lookups of the samples of a batch in the tables.
 
     Every row that the batch reads is taken from its table once: ``density`` and ``features`` are what the samples read,
     and their gradients are those of the tables (``ops.interpolate.Table``).
     """
 
-    shape: torch.Size
-    """(R, S) of the batch."""
-    index: Int[Tensor, "N"]
-    """Flat slots of the samples."""
-    heads: Int[Tensor, "N"]
-    planes: Int[Tensor, "N"]
     ndc: Float[Tensor, "N 3"]
-    spans: list[tuple[int, slice]]
-    """(head, its samples) for every head that occurs."""
-    taps: list[Taps]
-    """Of the samples of all MPIs together, then of those of the cube; positions are among ``rows``."""
+    """Positions of the samples, with gradients to rays that have them."""
+    taps: Taps
+    """Of the samples; positions are among ``rows``."""
     rows: Int[Tensor, "U"]
     """Distinct rows of the tables, ascending."""
     density: Float[Tensor, "U 1"]
@@ -65,14 +59,7 @@ class Lookup:
 
     def read(self, values: Float[Tensor, "U C"]) -> Float[Tensor, "N C"]:
         """Interpolated values of the samples, from those of the rows."""
-        parts = [weigh_rows(values, taps.positions, taps.weights) for taps in self.taps]
-        return torch.cat(parts) if parts else values.new_zeros(0, values.shape[1])
-
-    def by_head(self, values: Float[Tensor, "N *C"]) -> Iterator[tuple[int, slice, Tensor]]:
-        """(head, its samples, their values) for every head that occurs."""
-        # Split, not sliced: the gradient of a slice is as large as the whole.
-        parts = values.split([samples.stop - samples.start for _, samples in self.spans])
-        return ((k, samples, part) for (k, samples), part in zip(self.spans, parts, strict=True))
+        return weigh_rows(values, self.taps.positions, self.taps.weights)
 
 
 class TexelTables(Field):
@@ -228,26 +215,24 @@ class TexelTables(Field):
 
     @torch.no_grad()
     def note_use(
-        self, lookup: Lookup, weights: Float[Tensor, "R S"], crossings: Int[Tensor, "R"], errors: Float[Tensor, "R"]
+        self, lookup: Lookup, samples: MergedSamples, weights: Float[Tensor, "N"], errors: Float[Tensor, "R"]
     ) -> None:
         """Raises the peaks of bricks to the largest weight of a sample of a training batch that reads them, and adds
         weights times errors to the gains of the bricks of first texels, in the order of samples.
 
         Args:
             lookup: of the samples in the tables.
+            samples: of the batch.
             weights: of the samples.
-            crossings: number of samples of each ray before pruning.
             errors: squared errors of the rays' colours, 0 where a ray has none.
         """
-        of_samples, bricks = weights.reshape(-1).index_select(0, lookup.index), lookup.rows >> 6
-        shares = of_samples * errors.index_select(0, lookup.index // weights.shape[1])
-        sizes = [len(each.positions) for each in lookup.taps]
-        for each, weight, share in zip(lookup.taps, of_samples.split(sizes), shares.split(sizes), strict=True):
-            read = bricks.index_select(0, each.positions.reshape(-1))
-            self.peak.scatter_reduce_(0, read, weight.repeat_interleave(each.positions.shape[1]), "amax")
-            if self.num_copies == 0:
-                self.gain.index_add_(0, bricks.index_select(0, each.positions[:, 0]), share)
-        self.crossings += crossings.sum()
+        bricks, positions = lookup.rows >> 6, lookup.taps.positions
+        read = bricks.index_select(0, positions.reshape(-1))
+        self.peak.scatter_reduce_(0, read, weights.repeat_interleave(positions.shape[1]), "amax")
+        if self.num_copies == 0:
+            shares = weights * errors.index_select(0, samples.rays)
+            self.gain.index_add_(0, bricks.index_select(0, positions[:, 0]), shares)
+        self.crossings += samples.num_intersected.sum()
 
     @torch.no_grad()
     def release_unused(self, least: float) -> Int[Tensor, "K"] | None:

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from mmpi_ns.ops.build import structs
@@ -28,18 +28,6 @@ class Tables(NamedTuple):
     reliability: Float[Tensor, "T 1"]
     touched: UInt8[Tensor, "T"]
     """1 where a training ray read the row."""
-
-
-class Places(NamedTuple):
-    """Positions of samples, in S slots of every ray."""
-
-    heads: Int[Tensor, "R S"]
-    planes: Int[Tensor, "R S"]
-    """Undefined in the cube."""
-    ndc: Float[Tensor, "R S 3"]
-    """Position in the head."""
-    valid: Bool[Tensor, "R S"]
-    """Which slots hold a sample."""
 
 
 @dataclass(frozen=True, eq=False)

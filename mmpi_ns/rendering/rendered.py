@@ -62,7 +62,7 @@ class Exposures(torch.nn.Module):
 
 @dataclass(frozen=True)
 class RenderedRays:
-    """R rays with S merged samples each. In training, pixel rays, then keypoint rays (both repeated for every MPI that
+    """R rays with their merged samples. In training, pixel rays, then keypoint rays (both repeated for every MPI that
     renders them)."""
 
     bundle: RayBundle
@@ -108,11 +108,9 @@ def render_rays(
     tau, lookup = samples.tau, None
     if torch.is_grad_enabled():
         tau, lookup = field.optical_depths(bundle, samples)
-        if options.blends and lookup.index.numel():
-            shares = field.sample_shares(bundle, samples, lookup)
-            blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares)
-            tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
-    composite = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
+        if options.blends and tau.numel():
+            tau = blended_optical_depth(tau, *field.sample_shares(bundle, samples))
+    composite = composite_weights(tau, samples.starts, samples.skipped_before, samples.skipped_total)
     # Keypoint rays, whose points have a depth and no pixel, are supervised in depth alone and need no colours.
     keypoints = bundle.keypoint_disparities if isinstance(bundle, TrainingRays) and lookup is not None else None
     chosen = None if keypoints is None else keypoints[:, 0] == 0
@@ -143,8 +141,8 @@ def render_outputs(
     else:
         rendered = render_rays(bundle, field, options, head_mask)
         rgb, composite, samples = rendered.rgb, rendered.composite, rendered.samples
-        inverse_t = median_inverse_distance(composite.weights, samples.inverse_t, samples.valid)
-        winner = winning_heads(composite.weights, samples.heads, field.plan.num_heads)
+        inverse_t = median_inverse_distance(composite.weights, samples.inverse_t, samples.starts)
+        winner = winning_heads(composite.weights, samples.heads, samples.starts, field.plan.num_heads)
         dropped_mass = samples.dropped_mass
     return {
         "rgb": rgb,

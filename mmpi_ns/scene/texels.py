@@ -72,10 +72,20 @@ class TexelGrid:
         rows = torch.stack([self.row(plane, y + dy, x + dx) for dy in (0, 1) for dx in (0, 1)], -1)
         return rows, torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], -1)
 
-    def trilinear(self, ndc: Float[Tensor, "N 3"]) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
-        """Rows and weights at NDC (u, v, s) in [-1, 1]^3, s running over planes (or z layers)."""
+    def trilinear(
+        self, ndc: Float[Tensor, "N 3"], planes: Int[Tensor, "N"] | None = None
+    ) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
+        """Rows and weights at NDC (u, v, s) in [-1, 1]^3, s running over planes (or z layers).
+
+        ``planes``: of samples on a plane, which read its four texels and those again with weight 0; -1 for the others.
+        """
         z, fz = _cell(ndc[:, 2], self.depth)
-        (near, weights), (far, _) = self.bilinear(z, ndc), self.bilinear(z + 1, ndc)
+        behind = z + 1
+        if planes is not None:
+            between = planes < 0
+            z, behind = (torch.where(between, x, planes) for x in (z, behind))
+            fz = torch.where(between, fz, 0.0)
+        (near, weights), (far, _) = self.bilinear(z, ndc), self.bilinear(behind, ndc)
         return torch.cat([near, far], -1), torch.cat([weights * (1 - fz)[:, None], weights * fz[:, None]], -1)
 
     def nearest(self, ndc: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:

@@ -5,14 +5,13 @@ Weights and normalisations: docs/how_it_works.md. Total variation is computed on
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.depth_sums import DepthSums, depth_sums
 from mmpi_ns.rendering.rendered import RenderedRays
 from mmpi_ns.settings import LossWeights
 
@@ -22,8 +21,6 @@ PLANE_ERROR = 0.6
 """Minimum error of a depth prior, in spacings of the densest planes."""
 TV_EVERY = 4
 """Total variation is added every this many steps, with its weight multiplied by the same number."""
-REACH = 3.0
-"""Widths within which a sample reaches the target of its ray."""
 DEPTH_OUTLIERS = 0.02
 """Likelihood of a depth prior where a ray has no weight: the larger, the less influence outliers have."""
 KEYPOINT_WIDTH, KEYPOINT_OUTLIERS = 0.06, 1e-4
@@ -67,51 +64,6 @@ def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]
     """Entropy of the transmittance behind the last sample: a ray should be either opaque or empty (L_bg)."""
     p = transmittance.clamp(1e-6, 1 - 1e-6)
     return -(p * p.log() + (1 - p) * (1 - p).log()).mean()
-
-
-class DepthSums(NamedTuple):
-    """Sums over the samples of each ray."""
-
-    spread: Float[Tensor, "R"]
-    """sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 delta, with s = 1 / (1 + scale / t)."""
-    mass: Float[Tensor, "R"]
-    """sum_i w_i exp(-1/2 ((1/t_i - target) / width)^2)."""
-    reached: Bool[Tensor, "R"]
-    """Whether the ray has a target and a sample within three widths of it."""
-
-
-def depth_sums(
-    weights: Float[Tensor, "R S"],
-    inverse_t: Float[Tensor, "R S"],
-    valid: Bool[Tensor, "R S"],
-    intervals: Float[Tensor, "R"],
-    targets: Float[Tensor, "R 2"],
-    scale: float,
-) -> DepthSums:
-    """Spread and mass of each ray, with gradients to the weights of its samples.
-
-    Args:
-        weights: rendering weights, 0 in empty slots.
-        inverse_t: inverse distances of the samples, front to back.
-        valid: which slots hold a sample.
-        intervals: delta, the length of a ray's samples on the map s.
-        targets: inverse distance of the depth prior, 0 for none, and the width of the window around it (> 0).
-        scale: distance that s maps to 1/2.
-
-    Source: spread: mip-NeRF 360 eq. (15), in O(S) a ray by prefix sums as in DVGO v2.
-    """
-    with torch.no_grad():  # in place: memory takes most of the time
-        positions = (scale * inverse_t).add_(1).reciprocal_()
-        passed, moments = weights.cumsum(-1), (weights * positions).cumsum(-1)
-        slope = (2 * passed).sub_(passed[:, -1:]).mul_(positions).add_(moments[:, -1:]).sub_(moments, alpha=2)
-        slope.mul_(2).addcmul_(weights, intervals[:, None], value=2 / 3)
-        away = (inverse_t - targets[:, :1]).div_(targets[:, 1:]).square_()
-        nearest = torch.where(valid, away, torch.inf).amin(-1)
-        # Bounded from below, since exponentials that underflow take far longer.
-        window = away.clamp_(max=120).mul_(-0.5).exp_()
-    twice = (weights * slope).sum(-1)  # a quadratic form of the weights, half of their product with its gradient
-    reached = (nearest < REACH**2) & (targets[:, 0] > 0)
-    return DepthSums(twice - 0.5 * twice.detach(), (weights * window).sum(-1), reached)
 
 
 def depth_priors(
@@ -202,7 +154,7 @@ def _depth_sums(rays: RenderedRays, bundle: TrainingRays, field: MMPIField) -> D
         windows = torch.cat([keypoints, KEYPOINT_WIDTH * keypoints], -1)
         targets = torch.where(keypoints > 0, windows, targets)
     weights, intervals = rays.composite.weights, 1 / samples.num_intersected.clamp(min=1).to(rays.rgb)
-    return depth_sums(weights, samples.inverse_t, samples.valid, intervals, targets, field.plan.content_near)
+    return depth_sums(weights, samples.inverse_t, samples.starts, intervals, targets, field.plan.content_near)
 
 
 def over_background(image: Tensor, background: Tensor | float) -> Tensor:

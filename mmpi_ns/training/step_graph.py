@@ -36,7 +36,7 @@ MARGIN = 1.125
 """Capacity relative to the most samples so far: of a hundred steps none had more than 1.044 times those of the sixteen
 before."""
 MORE = 1024
-"""Additional capacity in samples of each head, and rows."""
+"""Additional capacity in samples, and in rows."""
 FULL = 0.97
 """Share of the capacity above which it is increased from the next step on."""
 LATE = 4
@@ -70,7 +70,7 @@ class Results:
     values: Tensor | None = None
     """[V], the sum of all losses first."""
     used: Int[Tensor, "2+H"] | None = None
-    """Slots of the widest ray, samples of each head, and distinct rows."""
+    """Samples, those of each head, and distinct rows."""
 
     def as_returned(self) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         """As ``Trainer.train_iteration`` returns it."""
@@ -190,8 +190,8 @@ class StepGraphs:
         if capacity is not None:
             numbers, distinct = rays.samples.numbers, rays.lookup.distinct
             results.used = torch.cat([numbers, distinct[None].to(numbers.dtype)])
-            fits = (numbers[0] < capacity.slots) & (distinct <= capacity.rows)
-            for number, most in zip(numbers[1:].unbind(), capacity.heads, strict=True):
+            fits = distinct <= capacity.rows
+            for number, most in zip(numbers.unbind(), (capacity.samples, *capacity.heads), strict=True):
                 fits = fits & (number <= most)
             (total * fits).backward()
         else:
@@ -215,14 +215,14 @@ class StepGraphs:
     def _measure(self, rays: Any) -> None:
         samples, lookup = rays.samples, rays.lookup
         self._measured += 1
-        self._note([samples.valid.shape[1], *(samples.head_counts or ()), len(lookup.rows)])
+        self._note([len(samples.heads), *(samples.head_counts or ()), len(lookup.rows)])
 
     def _note(self, used: list[int]) -> None:
         """Includes the samples of a step in the capacity of the next ones."""
         for place, number in enumerate(used):
             self._most[place] = max(self._most[place], number)
-        slots, *heads, rows = (int(MARGIN * self._most[place]) for place in range(len(used)))
-        self.capacity = Capacity(slots + 2, tuple(n + MORE for n in heads), rows + MORE)
+        samples, *heads, rows = (int(MARGIN * self._most[place]) + MORE for place in range(len(used)))
+        self.capacity = Capacity(samples, tuple(heads), rows)
 
     def _send(self, results: Results) -> None:
         """Copies the counts of a step to the host."""
@@ -247,7 +247,7 @@ class StepGraphs:
                 event.synchronize()
             wait = False
             self._pending.popleft()
-            used, room = here.tolist(), (capacity.slots - 1, *capacity.heads, capacity.rows)
+            used, room = here.tolist(), (capacity.samples, *capacity.heads, capacity.rows)
             self.lost += any(n > most for n, most in zip(used, room, strict=True))
             full = [n > FULL * most for n, most in zip(used, room, strict=True)]
             if any(full) and capacity is self.capacity:  # samples beyond the capacity may not be counted in full

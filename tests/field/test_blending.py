@@ -22,8 +22,8 @@ def shares_of(votes, dtype=F64):
 
 
 def composite_all(tau):
-    nothing, everything = torch.zeros_like(tau), torch.ones_like(tau, dtype=torch.bool)
-    return composite_weights(tau, everything, nothing, nothing[:, :1])
+    """Of one ray."""
+    return composite_weights(tau, torch.tensor([0, len(tau)]), torch.zeros_like(tau), tau.new_zeros(1, 1))
 
 
 # Shares --------------------------------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_opaque_copies_that_share_equally_leak(heads):
     votes = (np.zeros((heads, heads)), np.ones((heads, heads), bool), np.arange(heads))
     tau = blended_optical_depth(torch.full((heads,), 1e4, dtype=F64), *shares_of(votes))
     leak = (1 - 1 / heads) ** heads
-    assert composite_all(tau[None]).transmittance.item() == pytest.approx(leak, abs=1e-12)
+    assert composite_all(tau).transmittance.item() == pytest.approx(leak, abs=1e-12)
 
 
 def test_blended_depth_never_exceeds_depth_and_is_never_negative():
@@ -148,6 +148,6 @@ def test_reliability_learns_in_the_direction_that_helps():
     reliability = tensor([[0.3, -0.2]]).requires_grad_()
     shares = blend_shares(reliability, torch.tensor([[True, True]]), torch.tensor([0]))
     tau = blended_optical_depth(tensor([1e4]), *shares)
-    composite_all(tau[None]).weights.sum().backward()
+    composite_all(tau).weights.sum().backward()
     p = 1 / (1 + math.exp(-0.5))
     assert reliability.grad[0].tolist() == pytest.approx([p * (1 - p), -p * (1 - p)])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hand_made import make_mpi
 from random_fields import bundle, fill, random_plan, random_rays, render, sampled
-from random_scenes import dense_grad
+from random_scenes import dense_grad, of_rays
 
 from mmpi_ns.blending import log_shares
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -33,7 +33,7 @@ def block(field, k, table="features"):
 @pytest.mark.parametrize("planes", [2, 16, 64, 256])
 def test_every_plane_starts_with_an_equal_share_of_a_ray_that_crosses_all(planes):
     actual = render(MMPIField(one_mpi(planes=planes)).eval(), bundle([[0, 0, 0]], [[0.1, 0.2, 0.97]]))
-    assert actual.samples.valid.shape == (1, planes)
+    assert actual.samples.starts.tolist() == [0, planes]
     # The last plane is not quite opaque: all that reaches it is 1/L, of which it takes 99.9 %.
     assert torch.allclose(actual.composite.weights, torch.tensor(1 / planes), rtol=2e-3)
     assert actual.composite.transmittance.item() == pytest.approx(0.001 / planes, rel=0.05)
@@ -44,7 +44,7 @@ def test_mpis_that_train_jointly_start_with_a_share_of_the_depth_each():
     rays = bundle([[0, 0, 0]], [[0, 0, 1]])
     joint = render(MMPIField(plan, shares_depth=True).eval(), rays).composite
     alone = render(MMPIField(one_mpi()).eval(), rays).composite
-    assert torch.allclose(joint.weights.view(9, 3).sum(-1), alone.weights[0], atol=1e-6)
+    assert torch.allclose(joint.weights.view(9, 3).sum(-1), alone.weights, atol=1e-6)
     assert torch.allclose(joint.transmittance, alone.transmittance, atol=1e-6)
 
 
@@ -90,7 +90,8 @@ def test_growing_keeps_the_parameters_and_a_bilinear_field():
     assert float(field.texel_factor) == 1.0 and [g.width for g in field.grids] == [7, 7, 4]
     fine = render(field, rays)
     assert (coarse.samples.num_intersected > 3).any()
-    mpi_only = (coarse.samples.heads < 2).all(1)  # the cube's samples lie closer when it grows
+    in_mpis = [x < 2 for x in of_rays(coarse, coarse.samples.heads)]
+    mpi_only = torch.stack([x.all() for x in in_mpis])  # the cube's samples lie closer when it grows
     (long, thick), (short, thin) = ((x.cube.step, x.cube_interval) for x in (layout, field.layout))
     assert thin == 1 and long > 1.2 * short and thick == pytest.approx(long / short), "and are thinner"
     assert mpi_only.sum() > 5
@@ -167,8 +168,8 @@ def test_gradients_are_those_of_the_rows_of_the_batch(plan):
     field = fill(MMPIField(plan), seed=5)
     field.touched.fill_(0)
     _, lookup = trained_once(field, bundle(*random_rays(plan, 3, seed=2)))
-    read = {row for taps in lookup.taps for row in lookup.rows[taps.positions].reshape(-1).tolist()}
-    weighted = {r for taps in lookup.taps for r in lookup.rows[taps.positions][taps.weights > 0].tolist()}
+    rows = lookup.rows[lookup.taps.positions]
+    read, weighted = set(rows.reshape(-1).tolist()), set(rows[lookup.taps.weights > 0].tolist())
     assert 0 < len(read) < plan.texels
     for table in (field.density, field.features):
         assert set(table.grad_rows.tolist()) == read and table.grad.shape == (len(read), table.shape[1])
@@ -190,9 +191,8 @@ def test_reliability_learns_where_heads_overlap(plan):
     field = fill(MMPIField(plan), seed=6)
     rays = bundle(np.zeros((2, 3)), [[0, 0, 1], [0.7, 0.2, 0.7]])
     samples = sampled(field, rays)
-    _, lookup = field.optical_depths(*samples)
-    log_p, _ = field.sample_shares(*samples, lookup)
-    log_p[lookup.heads == 0].sum().backward()
+    log_p, _ = field.sample_shares(*samples)
+    log_p[samples[1].heads == 0].sum().backward()
     grad = dense_grad(field.reliability)
     for grid in field.grids:
         assert grad[grid.rows].abs().sum() > 0
@@ -206,7 +206,7 @@ def test_total_variation_is_the_sum_over_touched_texels_and_their_neighbours(wit
     field = fill(MMPIField(ScenePlan(mpis, cube, 0.05, 1.0), feature_channels=4), seed=7, log_depths=(-2, 0.5))
     samples = sampled(field, bundle([[0, 0, 0]], [[-0.4, -0.15, 0.9]]))
     _, lookup = field.optical_depths(*samples)
-    touched = {row for taps in lookup.taps for row in lookup.rows[taps.positions].reshape(-1).tolist()}
+    touched = set(lookup.rows.tolist())
     wanted, gradient, size = 0.0, np.zeros(len(field.density)), field.plan.texels
     for k, grid in enumerate(field.grids):
         shape = (grid.depth, grid.height, grid.width)
@@ -256,7 +256,7 @@ def test_differences_of_chroma_count_more_in_the_gradient_of_features_alone():
 def test_a_batch_without_samples_has_no_variation_and_no_density(plan):
     field = MMPIField(plan)
     tau, lookup = field.optical_depths(*sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]])))
-    assert tau.shape == (1, 1) and tau.item() == 0
+    assert tau.shape == (0,)
     assert field.total_variation(lookup, 1.0, 1.0).item() == 0
     assert field.sample_colors(*sampled(field, bundle([[0, 0, 0]], [[0, 0, -1]]))).abs().sum() == 0
 

@@ -29,7 +29,7 @@ def rendered(field, rays, gradients=False, chosen=None):
     with torch.set_grad_enabled(gradients):
         _, samples = sampled(field, rays)
         tau, lookup = field.optical_depths(rays, samples) if gradients else (samples.tau, None)
-        made = composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
+        made = composite_weights(tau, samples.starts, samples.skipped_before, samples.skipped_total)
         rgb, sums = field.render_colors(rays, samples, lookup, made, chosen)
         return SimpleNamespace(rgb=rgb, **vars(sums)), made
 

@@ -14,35 +14,26 @@ from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.interpolate import index_rows
 from mmpi_ns.scene.texels import BRICK
 
-BRICKS, RAYS, SLOTS = 40, 90, 11
+BRICKS, RAYS = 40, 90
 
 
-def use(of_planes, of_cube=(), seed=0):
-    """Rows, taps, slots, weights, errors, peaks and gains of samples that read these rows of tables, in slots that rise
-    among the planes and again in the cube."""
-    g = torch.Generator().manual_seed(seed)
-    groups = [torch.as_tensor(x) for x in (of_planes, of_cube) if len(x)]
-    order = torch.randperm(RAYS * SLOTS, generator=g)[: sum(map(len, groups))]
-    slots = [x.sort().values for x in order.split([len(x) for x in groups])]
-    index = index_rows(torch.cat([torch.zeros(0, dtype=torch.int64), *(x.reshape(-1) for x in groups)]), BRICKS * BRICK)
-    positions = index.positions.split([x.numel() for x in groups])
-    taps = [Taps(p.view(x.shape), torch.ones(x.shape)) for p, x in zip(positions, groups, strict=True)]
-    weights, errors = normal(RAYS, SLOTS, seed=seed).abs(), normal(RAYS, seed=seed + 1).abs()
-    weights[:20] = 0
+def use(read, seed=0):
+    """Rows, taps, rays, weights, errors, peaks and gains of samples that read these rows of tables."""
+    g, index = torch.Generator().manual_seed(seed), index_rows(torch.as_tensor(read), BRICKS * BRICK)
+    rays = torch.randint(0, RAYS, (len(read),), generator=g).sort().values
+    weights, errors = normal(len(read), seed=seed).abs(), normal(RAYS, seed=seed + 1).abs()
+    weights[: len(read) // 5] = 0
     records = (0.1 * normal(BRICKS, seed=seed + 2).abs() for _ in range(2))
-    return index.unique, taps, torch.cat([order[:0], *slots]), weights, errors, *records
+    return index.unique, Taps(index.positions, torch.ones(read.shape)), rays, weights, errors, *records
 
 
-def by_loops(rows, taps, slots, weights, errors, peak, gain):
+def by_loops(rows, taps, rays, weights, errors, peak, gain):
     """New peaks, and gains summed in float64."""
-    peaks, gains, slot = peak.tolist(), gain.tolist(), iter(slots.tolist())
-    for each in taps:
-        for read in rows[each.positions.long()].tolist():
-            ray, place = divmod(next(slot), SLOTS)
-            weight = float(weights[ray, place])
-            for row in read:
-                peaks[row // BRICK] = max(peaks[row // BRICK], weight)
-            gains[read[0] // BRICK] += weight * float(errors[ray])
+    peaks, gains = peak.tolist(), gain.tolist()
+    for read, ray, weight in zip(rows[taps.positions.long()].tolist(), rays.tolist(), weights.tolist(), strict=True):
+        for row in read:
+            peaks[row // BRICK] = max(peaks[row // BRICK], weight)
+        gains[read[0] // BRICK] += weight * float(errors[ray])
     return peaks, gains
 
 
@@ -55,29 +46,29 @@ def cells(count, seed=0, most=BRICKS * BRICK):
 
 
 CASES = {
-    "planes and cube": (cells(500), torch.cat([cells(300, seed=1), cells(300, seed=2)], 1)),
-    "planes alone": (cells(700, seed=3),),
-    "the cube alone": ((), torch.cat([cells(200, seed=4), cells(200, seed=5)], 1)),
-    "one brick": (7 * BRICK + cells(400, seed=6, most=BRICK),),
-    "one row": (torch.full((300, 4), 1234),),
-    "the first and the last row": (torch.tensor([[0, BRICKS * BRICK - 1] * 2] * 9),),
-    "one sample": (cells(1),),
-    "no sample": ((),),
+    "planes": cells(700, seed=3),
+    "with a cube": torch.cat([cells(500, seed=4), cells(500, seed=5)], 1),
+    "one brick": 7 * BRICK + cells(400, seed=6, most=BRICK),
+    "one row": torch.full((300, 4), 1234),
+    "the first and the last row": torch.tensor([[0, BRICKS * BRICK - 1] * 2] * 9),
+    "one sample": cells(1),
+    "no sample": cells(0),
 }
 
 
 def noted(arguments):
     """Peaks and gains afterwards."""
-    rows, taps, slots, weights, errors, *records = arguments
+    rows, taps, rays, weights, errors, *records = arguments
     peak, gain = (x.clone() for x in records)
     field = SimpleNamespace(peak=peak, gain=gain, num_copies=0, crossings=0)
-    TexelTables.note_use(field, SimpleNamespace(rows=rows, taps=taps, index=slots), weights, weights[:, 0], errors)
+    samples = SimpleNamespace(rays=rays, num_intersected=rays)
+    TexelTables.note_use(field, SimpleNamespace(rows=rows, taps=taps), samples, weights, errors)
     return [peak, gain]
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_peaks_and_gains_are_those_of_loops(case):
-    arguments = use(*CASES[case])
+    arguments = use(CASES[case])
     (peak, gain), (peaks, gains) = noted(arguments), by_loops(*arguments)
     assert peak.tolist() == peaks and gain.tolist() == pytest.approx(gains, rel=1e-6)
     if len(arguments[2]) > 1:
@@ -85,13 +76,13 @@ def test_peaks_and_gains_are_those_of_loops(case):
 
 
 def test_samples_without_weight_change_nothing():
-    rows, taps, slots, weights, *rest = use(*CASES["planes and cube"])
-    arguments = (rows, taps, slots, 0 * weights, *rest)
+    rows, taps, rays, weights, *rest = use(CASES["planes"])
+    arguments = (rows, taps, rays, 0 * weights, *rest)
     assert all(torch.equal(a, b) for a, b in zip(noted(arguments), rest[1:], strict=True))
 
 
 def test_a_weight_that_is_not_a_number_is_seen_and_stays():
-    rows, taps, slots, weights, *rest = use(CASES["one row"][0])
-    weights.view(-1)[slots[5]] = math.nan
-    peak, gain = noted((rows, taps, slots, weights, *rest))
+    rows, taps, rays, weights, *rest = use(CASES["one row"])
+    weights[5] = math.nan
+    peak, gain = noted((rows, taps, rays, weights, *rest))
     assert peak.isnan().nonzero().tolist() == gain.isnan().nonzero().tolist() == [[1234 // BRICK]]

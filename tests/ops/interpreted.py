@@ -111,8 +111,7 @@ def test_the_march_keeps_what_the_reference_keeps(monkeypatch, blends, threshold
     monkeypatch.setattr("mmpi_ns.sampler.OPAQUE_DEPTH", math.inf)  # the reference stops blending at T = 1e-4
     field = random_field(3, True, seed=3, planes=14)
     _, plain = compare(field, bundle(*random_rays(field.plan, 40, seed=1)), threshold, blends)
-    valid = plain.samples.valid
-    assert plain.samples.heads[valid].unique().numel() == 4
+    assert plain.samples.heads.unique().numel() == 4
     assert (plain.samples.dropped_mass > 1e-3).any() == (threshold > 0)
 
 
@@ -136,7 +135,7 @@ def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monke
         tensors = [fast.rgb, fast.composite.weights, *actual.values()]
         assert all(torch.isfinite(t.float()).all() for t in tensors)
     names = list(HARD_RAYS)
-    heads = actual["heads"][names.index("on the axis")][actual["valid"][names.index("on the axis")]]
+    heads = actual["heads"][actual["rays"] == names.index("on the axis")]
     assert raw != 0 or (heads == 1).any(), "equal distances: the twin's samples follow the first MPI's"
     assert (
         fast.samples.num_intersected[names.index("along the planes")] == 0
@@ -156,7 +155,7 @@ def test_densities_that_are_no_numbers_end_the_march_all_the_same():
     field = random_field(2, False, seed=1, planes=10)
     field.density.data.fill_(math.nan)
     _, samples = sampled(field, bundle(*random_rays(field.plan, 5, seed=1)), 1e-3)
-    assert samples.valid.shape[0] == 5
+    assert len(samples.starts) == 6
 
 
 def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
@@ -168,12 +167,10 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
         field.zero_grad(set_to_none=True)
         _, samples = sampled(field, rays, 1e-3, blends=True)
         tau, lookup = field.optical_depths(rays, samples)
-        share = field.sample_shares(rays, samples, lookup)
-        flat = blending.blended_optical_depth(tau.reshape(-1)[lookup.index], *share)
-        tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
-        made = composite.composite_weights(tau, samples.valid, samples.skipped_before, samples.skipped_total)
-        colors = field.sample_colors(rays, samples, lookup)
-        loss = (composite.render_colors(made, colors) * upstream).sum() + made.accumulation.sum()
+        tau = blending.blended_optical_depth(tau, *field.sample_shares(rays, samples))
+        made = composite.composite_weights(tau, samples.starts, samples.skipped_before, samples.skipped_total)
+        colors = composite.render_colors(made, field.sample_colors(rays, samples, lookup), samples.starts)
+        loss = (colors * upstream).sum() + made.accumulation.sum()
         (loss + 0.1 * field.total_variation(lookup, 1.0, 1.0)).backward()
         return {n: dense_grad(p) if isinstance(p, Table) else p.grad for n, p in params.items()}
 

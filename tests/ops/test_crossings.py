@@ -28,18 +28,17 @@ def found_and_wanted(mpis, origins, directions, near=0.05, far=math.inf):
     m = march(field.layout, field.tables, Rays(*rays, *bounds), MarchOptions(0.0))
     wanted = geometry.plane_hits(*(x.double() for x in (*rays, *bounds)), frames)
     number = frames.num_planes[m.heads] - 1 - m.planes
-    mine = [m.valid & (m.heads == k) for k in range(len(mpis))]
-    count = torch.stack([x.sum(1) for x in mine], 1)
-    first = torch.stack([torch.where(x, number, -1).amax(1) for x in mine], 1)
+    count, none = torch.zeros_like(wanted.count), torch.full_like(wanted.count, -1)
+    count.index_put_((m.rays, m.heads), torch.ones_like(number), accumulate=True)
+    first = none.view(-1).scatter_reduce(0, m.rays * len(mpis) + m.heads, number, "amax").view(none.shape)
     assert torch.equal(m.num_intersected, count.sum(1)) and torch.equal(m.fully_covered[:, 0], count.sum(1) > 0)
-    ray, slot = m.valid.nonzero(as_tuple=True)
-    head = m.heads[ray, slot]
-    w = sample_disparity(number[ray, slot], frames.disparity_steps[head], frames.last_disparities[head])
+    ray, head = m.rays, m.heads
+    w = sample_disparity(number, frames.disparity_steps[head], frames.last_disparities[head])
     low, high = frames.extents[head][:, 0::2], frames.extents[head][:, 1::2]
     at = torch.stack([x[ray, head, 0] + w * x[ray, head, 1] for x in (wanted.u, wanted.v)], -1)
     o, d = wanted.local_origins[ray, head, 2], wanted.local_directions[ray, head, 2]
     places = torch.cat([2 * (at - low) / (high - low) - 1, inverse_distance(w, o, d)[:, None]], -1)
-    actual = torch.cat([m.ndc[ray, slot, :2], m.inverse_t[ray, slot, None]], -1).double()
+    actual = torch.cat([m.ndc[:, :2], m.inverse_t[:, None]], -1).double()
     return SimpleNamespace(count=count, m_first=first, places=actual), SimpleNamespace(**vars(wanted), places=places)
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from bricked import bricked_field
 from compiled import both, compiled, normal  # noqa: F401
+from random_fields import random_field
 from random_scenes import dense_grad
 
 from mmpi_ns.ops.interpolate import (
@@ -14,13 +15,11 @@ from mmpi_ns.ops.interpolate import (
     index_rows,
     interpolate,
     interpolate_densely,
-    order_by_head,
     read_rows,
     sum_rows,
     texel_rows,
     weigh_rows,
 )
-from mmpi_ns.ops.layout import Places
 
 F64 = torch.float64
 
@@ -110,22 +109,18 @@ def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each(channe
     assert torch.allclose(dense_grad(table), plain.grad, atol=1e-5)
 
 
-def places(rays=700, slots=9, heads=4):
-    g = torch.Generator().manual_seed(1)
-    of_heads, planes = (torch.randint(0, n, (rays, slots), generator=g) for n in (heads, 50))
-    return Places(of_heads, planes, normal(rays, slots, 3), torch.rand(rays, slots, generator=g) < 0.6)
-
-
-@pytest.mark.parametrize("counted", [False, True])
-def test_samples_by_head_are_those_of_loops(counted):
-    at = places()
-    heads, valid = at.heads.reshape(-1).tolist(), at.valid.reshape(-1).tolist()
-    of_heads = [[i for i, h in enumerate(heads) if valid[i] and h == k] for k in range(5)]
-    for slots, *columns, counts in both(lambda: order_by_head(at, 5, [*map(len, of_heads)] if counted else None)):
-        assert slots.tolist() == [i for x in of_heads for i in x]
-        assert list(counts) == [*map(len, of_heads)] and counts[4] == 0
-        expected = (at.heads.reshape(-1)[slots], at.planes.reshape(-1)[slots], at.ndc.reshape(-1, 3)[slots])
-        assert all(torch.equal(a, b) for a, b in zip(columns, expected, strict=True))
+@pytest.mark.parametrize("moves", [False, True])
+def test_rows_around_samples_are_those_of_their_heads(moves):
+    layout, g = random_field(3, True, seed=1).layout, torch.Generator().manual_seed(1)
+    heads, ndc = torch.randint(0, 4, (300,), generator=g), normal(300, 3).clamp(-1.1, 1.1).requires_grad_(moves)
+    planes = torch.randint(0, 12, (300,), generator=g)
+    for rows, weights in both(lambda: texel_rows(layout, heads, planes, ndc)):
+        for k, grid in enumerate(layout.grids):
+            own, at = heads == k, ndc[heads == k]
+            wanted = grid.bilinear(planes[own], at) if k < 3 else grid.trilinear(at)
+            size = wanted[0].shape[1]
+            assert torch.equal(rows[own][:, :size], wanted[0]) and torch.allclose(weights[own][:, :size], wanted[1])
+            assert not weights[own][:, size:].any() and torch.equal(rows[own][:, -4:], wanted[0][:, -4:])
 
 
 @pytest.mark.parametrize("threads", [3])
@@ -139,8 +134,7 @@ def test_bits_of_all_operations_on_rows_do_not_depend_on_threads(threads, monkey
     def work():
         index = index_rows(rows, 2**23 + 4)
         sums = sum_rows(index.positions, values, weights, len(index.unique))
-        by_head = order_by_head(places(rays=4000), 4)[:4]
-        return index.unique, index.positions, sums, *texel_rows(layout, heads, heads, ndc), *by_head
+        return index.unique, index.positions, sums, *texel_rows(layout, heads, heads, ndc)
 
     before, one = torch.get_num_threads(), work()
     try:

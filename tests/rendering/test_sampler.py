@@ -92,8 +92,8 @@ def test_samples_of_two_identical_mpis_tie_and_the_first_mpi_comes_first(blends)
     field = fill(MMPIField(ScenePlan(twin, None, 0.05, 1.0), feature_channels=5, hidden_width=6), seed=1)
     assert compare(field, *random_rays(field.plan, 10, seed=3), blends) >= 8
     samples = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), blends=blends).samples
-    assert samples.heads[0].tolist() == [0, 1] * 9
-    assert (samples.inverse_t[0, ::2] == samples.inverse_t[0, 1::2]).all()
+    assert samples.heads.tolist() == [0, 1] * 9
+    assert (samples.inverse_t[::2] == samples.inverse_t[1::2]).all()
 
 
 @pytest.mark.parametrize("blends", [True, False])
@@ -107,16 +107,14 @@ def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(thresho
     assert ((part.composite.accumulation - whole.composite.accumulation).abs() <= 1e-5).all()
     assert (dropped > 1e-4).any() and whole.samples.dropped_mass.max() == 0
     assert torch.equal(part.samples.num_intersected, whole.samples.num_intersected)
-    kept = part.samples.valid.sum()
-    assert kept < whole.samples.valid.sum() and kept > 0
-    missing = whole.composite.weights.sum(-1) - part.composite.weights.sum(-1)
-    assert torch.allclose(missing, dropped[:, 0], atol=2e-5)
+    assert 0 < len(part.samples.heads) < len(whole.samples.heads)
+    assert torch.allclose(whole.composite.mass - part.composite.mass, dropped, atol=2e-5)
 
 
 def test_with_a_fair_share_nothing_is_dropped_at_the_start_where_all_weights_are_equal():
     plan = ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)
     actual = render(MMPIField(plan).eval(), bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=0.5, fair_share=0.1)
-    assert actual.samples.valid.shape == (1, 64) and actual.samples.valid.all()
+    assert actual.samples.starts.tolist() == [0, 64]
     assert torch.allclose(actual.composite.weights, torch.tensor(1 / 64), rtol=0.01)
 
 
@@ -128,12 +126,12 @@ def test_rays_that_meet_nothing_are_empty(plan, blends):
     for directions in ([backwards], [backwards, forwards], np.zeros((0, 3))):
         actual = render(field, bundle(np.zeros((len(directions), 3)), directions), blends=blends)
         count = len(directions)
-        assert actual.rgb.shape == (count, 3) and len(actual.samples.valid) == count
+        assert actual.rgb.shape == (count, 3) and len(actual.samples.starts) == count + 1
         assert torch.isfinite(actual.rgb).all()
         if count:
             assert (actual.rgb[0] == 0).all() and actual.composite.transmittance[0] == 1
             assert actual.samples.num_intersected[0] == 0 and not actual.samples.fully_covered[0]
-            assert not actual.samples.valid[0].any()
+            assert actual.samples.starts[1] == 0
         if count == 2:
             assert actual.composite.transmittance[1] < 0.5
 
@@ -144,7 +142,7 @@ def test_samples_lie_between_near_and_far(near, far):
     origins, directions = random_rays(field.plan, 12, seed=13)
     assert compare(field, origins, directions, True, near=near, far=far) >= 4
     samples = render(field, bundle(origins, directions, near, far)).samples
-    t = 1 / samples.inverse_t[samples.valid]
+    t = 1 / samples.inverse_t
     assert t.min() >= near * (1 - 1e-5) and t.max() <= far * (1 + 1e-5)
 
 
@@ -153,13 +151,13 @@ def test_the_plane_at_infinity_is_sampled_where_the_ray_points_and_not_where_it_
     direction = unit([0.3, -0.2, 1.0])
     origins = np.array([[0, 0, 0], [0.2, 0.1, 500.0]])
     actual = render(field, bundle(origins, [direction, direction]))
-    last = [int(v.sum()) - 1 for v in actual.samples.valid]
-    assert last[1] == 0, "beyond all finite planes only infinity is left"
-    for i in range(2):
-        assert actual.samples.planes[i, last[i]] == 8
-        assert actual.samples.inverse_t[i, last[i]] == 0
-        assert actual.samples.ndc[i, last[i]].tolist() == pytest.approx([0.3, -0.4, 1.0], abs=1e-6)
-    assert torch.isfinite(actual.rgb).all() and actual.composite.weights[1, 0] > 0
+    last = actual.samples.starts[1:] - 1
+    assert last[1] == last[0] + 1, "beyond all finite planes only infinity is left"
+    for i in last:
+        assert actual.samples.planes[i] == 8
+        assert actual.samples.inverse_t[i] == 0
+        assert actual.samples.ndc[i].tolist() == pytest.approx([0.3, -0.4, 1.0], abs=1e-6)
+    assert torch.isfinite(actual.rgb).all() and actual.composite.weights[-1] > 0
     assert render(field, bundle(origins, [direction, direction], far=1e6)).samples.num_intersected.tolist() == [8, 0]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import oracle
 import torch
+from hand_made import starts_of
 from random_scenes import Array
 from scipy.special import expit
 from stability.cases import (
@@ -57,13 +58,13 @@ def _equal_start(planes: int, precision: Precision) -> Outcome:
     """A new MPI gives every plane the weight 1/L (the last one 0.999 of what is left)."""
     layout = _layout(planes)
     with precision.context():
-        tau = layout.optical_depth(0, torch.zeros(planes), torch.arange(planes))[None]
-        made = composite_weights(tau, tau > -1, torch.zeros_like(tau), torch.zeros(1, 1))
+        tau = layout.optical_depth(0, torch.zeros(planes), torch.arange(planes))
+        made = composite_weights(tau, torch.tensor([0, planes]), torch.zeros_like(tau), torch.zeros(1, 1))
     wanted = np.full(planes, 1 / planes)
     wanted[-1] *= 0.999
     # log(e^b - 1) is rounded once, at magnitudes up to |b|; the depths in front add up to log L.
     size = wanted * (1 + np.abs(oracle.plane_bias(planes)[0]).max() + math.log(planes))
-    return Outcome(compare(made.weights[0], wanted, size, 16))
+    return Outcome(compare(made.weights, wanted, size, 16))
 
 
 # Shares and blended depths -------------------------------------------------------------------------------------------
@@ -131,13 +132,14 @@ def _composite(taus: Array, precision: Precision, dropped: bool = False) -> Outc
     taus = single(taus)
     roundings = 4 + math.log2(taus.shape[1])
     kept = rng.random(taus.shape) < 0.5 if dropped else np.ones(taus.shape, bool)
-    skipped = np.where(kept, 0, taus)
-    constants = float32(np.cumsum(skipped, -1) - skipped), float32(skipped.sum(-1, keepdims=True))
+    skipped, there = np.where(kept, 0, taus), torch.tensor(kept)
+    before, total = float32(np.cumsum(skipped, -1) - skipped), float32(skipped.sum(-1, keepdims=True))
     by_weight, by_rest = single(rng.normal(size=taus.shape)), single(rng.normal(size=(len(taus), 1)))
 
     def composited(tau: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        made = composite_weights(tau, torch.tensor(kept), *constants)
-        return made.weights, made.transmittance, made.accumulation
+        made = composite_weights(tau[there], starts_of(there), before[there], total)
+        weights = torch.zeros(kept.shape).masked_scatter(there, made.weights)
+        return weights, made.transmittance, made.accumulation
 
     (weights, transmittance, accumulation), (gradient,) = tried(precision, composited, taus, by=(by_weight, by_rest))
     errors, gradients = [], []
@@ -159,27 +161,26 @@ def _composite(taus: Array, precision: Precision, dropped: bool = False) -> Outc
     return Outcome.of(errors, gradients)
 
 
-def _empty_slots(precision: Precision) -> Outcome:
-    """What is in an empty slot, NaN and infinity included, changes nothing and gets no gradient."""
-    valid, none = torch.tensor([[True, False, True, False, False]]), torch.zeros(1, 5)
+def _behind(precision: Precision) -> Outcome:
+    """What lies behind the last ray, NaN and infinity included, changes nothing and gets no gradient."""
     (weights,), (gradient,) = tried(
         precision,
-        lambda tau: composite_weights(tau, valid, none, none[:, :1]).weights,
-        [[0.3, math.nan, 0.5, math.inf, 1e30]],
+        lambda tau: composite_weights(tau, torch.tensor([0, 2]), torch.zeros(5), torch.zeros(1, 1)).weights,
+        [0.3, 0.5, math.nan, math.inf, 1e30],
     )
-    taus, wanted, slope = single([0.3, 0.5]), np.zeros((1, 5)), np.zeros((1, 5))
-    wanted[0, [0, 2]] = oracle.composite(taus).weights
-    slope[0, [0, 2]] = oracle.composite_gradient(taus, np.ones(2), 0.0)
+    taus, wanted, slope = single([0.3, 0.5]), np.zeros(5), np.zeros(5)
+    wanted[:2] = oracle.composite(taus).weights
+    slope[:2] = oracle.composite_gradient(taus, np.ones(2), 0.0)
     return Outcome(compare(weights, wanted, 1.0, 4), compare(gradient, slope, 1.0, 8))
 
 
 def _nothing(precision: Precision) -> Outcome:
     """A ray that meets nothing: black, transparent, infinitely far."""
-    tau, valid = torch.full((3, 4), 5.0), torch.zeros(3, 4, dtype=torch.bool)
+    tau, starts = torch.full((4,), 5.0), torch.zeros(4, dtype=torch.int64)
     with precision.context():
-        made = composite_weights(tau, valid, torch.zeros_like(tau), torch.zeros(3, 1))
-        rgb = render_colors(made, torch.rand(3, 4, 3))
-        median = median_inverse_distance(made.weights, torch.ones(3, 4), valid)
+        made = composite_weights(tau, starts, torch.zeros_like(tau), torch.zeros(3, 1))
+        rgb = render_colors(made, torch.rand(4, 3), starts)
+        median = median_inverse_distance(made.weights, torch.ones(4), starts)
     actual = torch.cat([rgb, made.accumulation, made.transmittance, median], -1)
     return Outcome(compare(actual, np.tile([0, 0, 0, 0, 1, 0], (3, 1)), 1.0, 0))
 
@@ -190,7 +191,8 @@ def _median(precision: Precision) -> Outcome:
     weights = single(rng.exponential(1e-4, (8, LONG)))
     inverse_t = single(-np.sort(-rng.random((8, LONG)), axis=-1))
     with precision.context():
-        actual = median_inverse_distance(float32(weights), float32(inverse_t), torch.ones(8, LONG, dtype=torch.bool))
+        starts = torch.arange(9) * LONG
+        actual = median_inverse_distance(float32(weights.ravel()), float32(inverse_t.ravel()), starts)
     at = (np.arange(8), np.abs(inverse_t - actual.double().numpy()).argmin(-1))
     gathered = np.cumsum(weights, -1)
     share, step = gathered[at] / gathered[:, -1], weights[at] / gathered[:, -1]
@@ -259,7 +261,7 @@ def cases() -> list[Case]:
     compositing = [(name, composited, partial(_composite, taus)) for name, taus in rays.items()]
     compositing += [
         ("half of 300 samples dropped", composited, partial(_composite, _mixed(-4, 0), dropped=True)),
-        ("empty slots that hold NaN, inf, 1e30", "as if they were not there", _empty_slots),
+        ("NaN, inf, 1e30 behind the last ray", "as if they were not there", _behind),
         ("rays that meet nothing", "black, transparent, 1/t = 0", _nothing),
         ("median distance in 10,000 samples", "half of the mass, to 17 roundings", _median),
     ]

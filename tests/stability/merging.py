@@ -12,12 +12,12 @@ import torch
 from random_scenes import Array
 from stability.cases import UNIT, Case, Outcome, Precision, compare, float32, single, tried
 
+from mmpi_ns.ops.depth_sums import depth_sums
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.variation import clamped_differences
 from mmpi_ns.sampler import merge, prune
 from mmpi_ns.scene.texels import BRICK, make_grids
 from mmpi_ns.training import losses
-from mmpi_ns.training.losses import depth_sums
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Lookups -------------------------------------------------------------------------------------------------------------
@@ -70,11 +70,11 @@ def _merge_order(keys: Array, precision: Precision, empty: bool = False) -> Outc
     flat = [(k, r, i) for k in range(heads) for r in range(rays) for i in range(counts[r, k])]
     distances = float32([keys[r, k, i] for k, r, i in flat])
     with precision.context():
-        index, valid = merge(torch.tensor([r for _, r, _ in flat]), distances, torch.tensor(per_ray))
+        index = merge(torch.tensor([r for _, r, _ in flat]), distances).split(per_ray.tolist())
     wrong = 0
     for ray in range(rays):
         wanted = [n for *_, n in sorted((-keys[r, k, i], k, i, n) for n, (k, r, i) in enumerate(flat) if r == ray)]
-        actual = index[ray][valid[ray]].tolist()
+        actual = index[ray].tolist()
         wrong += sum(a != b for a, b in zip(actual, wanted, strict=False)) + abs(len(actual) - len(wanted))
     return Outcome.of([], wrong=wrong)
 
@@ -83,16 +83,16 @@ def _dropping(taus: Array, threshold: float, share: float, precision: Precision,
     """What is kept, and mass and depth of what is dropped. Within 16 roundings of the bound either is right."""
     taus = single(taus)
     rays, samples = taus.shape
-    merged = (torch.arange(rays * samples).view(rays, samples), torch.ones(rays, samples, dtype=torch.bool))
+    starts = torch.arange(rays + 1) * samples
     with precision.context():
-        order, valid, skipped_before, skipped_total, dropped_mass = prune(
-            *merged, float32(taus.ravel()), threshold, share
+        index, skipped_before, starts, skipped_total, dropped_mass = prune(
+            float32(taus.ravel()), starts, threshold, share
         )
     errors, wrong, roundings = [], 0, 4 + math.log2(samples)
     for r in range(rays):
-        made, bound, there = oracle.composite(taus[r]), min(threshold, share / samples), valid[r]
+        made, bound, there = oracle.composite(taus[r]), min(threshold, share / samples), slice(*starts[r : r + 2])
         kept = np.zeros(samples, bool)
-        kept[(order[r][there] - r * samples).tolist()] = True
+        kept[(index[there] - r * samples).tolist()] = True
         size = made.weights * (1 - np.log(np.maximum(made.in_front, 1e-300)))
         unclear = np.abs(made.weights - bound) <= 16 * UNIT * size
         wrong += int(((kept != (made.weights > bound)) & ~unclear).sum()) + (keeps_all and not kept.all())
@@ -100,7 +100,7 @@ def _dropping(taus: Array, threshold: float, share: float, precision: Precision,
         before = (np.cumsum(dropped) - dropped)[kept]
         total, mass = dropped.sum(), made.weights[~kept].sum()
         errors += [
-            compare(skipped_before[r][there], before, before + total * 2.0**-20, roundings),
+            compare(skipped_before[there], before, before + total * 2.0**-20, roundings),
             compare(skipped_total[r], [total], total, roundings),
             compare(dropped_mass[r], [mass], size.sum(), roundings),
         ]
@@ -134,11 +134,11 @@ def _distortion(weights: Array, positions: Array, precision: Precision) -> Outco
     value = float((w * pairs).sum() + (w**2).sum() / count / 3) / rays
     slope = 2 * pairs + 2 * w / count / 3
     size = 2 * (s * w.sum(-1, keepdims=True) + (w * s).sum(-1, keepdims=True)) + w / count
-    everywhere, nothing = torch.ones(s.shape, dtype=torch.bool), torch.tensor([[0.0, 1.0]]).expand(rays, 2)
-    others = float32(inverse_t), everywhere, torch.full((rays,), 1 / count), nothing, 1.0
+    starts, nothing = torch.arange(rays + 1) * count, torch.tensor([[0.0, 1.0]]).expand(rays, 2)
+    others = float32(inverse_t.ravel()), starts, torch.full((rays,), 1 / count), nothing, 1.0
 
     def distortion(x: torch.Tensor) -> torch.Tensor:
-        return depth_sums(x, *others).spread.mean()
+        return depth_sums(x.flatten(), *others).spread.mean()
 
     wanted = value, (slope / rays).astype(np.float64), (size / rays).astype(np.float64)
     total = float(2 * (w.sum(-1) ** 2).mean()) + 1e-30
@@ -172,10 +172,10 @@ def _keypoint(precision: Precision) -> Outcome:
     # x is a difference of 1/t, 17 widths long: its rounding counts x^2 17 times.
     wanted = float(-np.log(mass)[reach].mean()), slope, np.abs(slope) * (1 + 20 * np.abs(x)) + 1e-30
     targets = float32(np.concatenate([depths, 0.06 * np.maximum(depths, 1e-12)], -1))
-    there = float32(q), torch.ones(6, 9, dtype=torch.bool), torch.zeros(6), targets, 1.0
+    there = float32(q.ravel()), torch.arange(7) * 9, torch.zeros(6), targets, 1.0
 
     def keypoint(v: torch.Tensor) -> torch.Tensor:
-        _, mass, reached = depth_sums(v, *there)
+        _, mass, reached = depth_sums(v.flatten(), *there)
         return losses.depth_priors(mass, reached, losses.KEYPOINT_OUTLIERS, reached.sum().clamp(min=1))
 
     return _loss(precision, keypoint, w, wanted, 60.0, 16)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from compiled import both, compiled  # noqa: F401
+from hand_made import starts_of
 
-from mmpi_ns.training.losses import depth_sums
+from mmpi_ns.ops.depth_sums import depth_sums
 
 HARD = {
     "random": {},
@@ -61,15 +63,19 @@ def oracle(weights, inverse_t, valid, intervals, targets, scale):
 def test_sums_and_gradients_equal_the_double_loops(case):
     *arrays, scale = rays(**HARD[case])
     spread, mass, reached, d_spread, d_mass = oracle(*(x.astype(np.float64) for x in arrays[:2]), *arrays[2:], scale)
-    tensors = [torch.from_numpy(x) if x.dtype == bool else torch.from_numpy(x).float() for x in arrays]
-    weights = tensors[0].requires_grad_()
-    sums = depth_sums(weights, *tensors[1:], scale)
+    weights, inverse_t, intervals, targets = (torch.from_numpy(x).float() for x in arrays if x.dtype != bool)
+    valid = torch.from_numpy(arrays[2])
+    samples = (weights.requires_grad_()[valid], inverse_t[valid], starts_of(valid), intervals, targets, scale)
+    for sums in both(lambda: depth_sums(*samples)):
+        check(sums, weights, valid, spread, mass, reached, d_spread, d_mass)
+
+
+def check(sums, weights, valid, spread, mass, reached, d_spread, d_mass):
     np.testing.assert_allclose(sums.spread.detach(), spread, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(sums.mass.detach(), mass, rtol=2e-3, atol=1e-5)
     # float32 may place a sample at exactly three widths on either side
     assert (sums.reached.numpy() != reached).mean() < 0.02
     up, down = torch.linspace(-1, 2, len(weights)), torch.linspace(3, -1, len(weights))
-    (gradient,) = torch.autograd.grad((up * sums.spread + down * sums.mass).sum(), weights)
+    (gradient,) = torch.autograd.grad((up * sums.spread + down * sums.mass).sum(), weights, retain_graph=True)
     expected = up.numpy()[:, None] * d_spread + down.numpy()[:, None] * d_mass
-    valid = arrays[2]
     np.testing.assert_allclose(gradient.numpy()[valid], expected[valid], rtol=3e-3, atol=3e-5)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from hand_made import make_mpi
+from hand_made import make_mpi, starts_of
 from random_fields import random_plan
 from training_runs import datamanager, plan_of, ready, trainer_config
 
@@ -27,26 +27,28 @@ def tensor(values, dtype=F64):
     return torch.tensor(np.asarray(values), dtype=dtype)
 
 
-def every(weights):
-    return torch.ones_like(weights, dtype=torch.bool)
+def sums_of(weights, inverse_t, intervals, targets, valid=None):
+    """Depth sums of the samples [R, S] that there are."""
+    valid = torch.ones_like(weights, dtype=torch.bool) if valid is None else valid
+    return depth_sums(weights[valid], inverse_t[valid], starts_of(valid), intervals, targets, 1.0)
 
 
 def distortion(weights, positions, intervals):
     """The loss of samples at positions in [0, 1]."""
     targets = weights.new_tensor([[0.0, 1.0]]).expand(len(weights), 2)
-    return depth_sums(weights, 1 / positions - 1, every(weights), intervals, targets, 1.0).spread.mean()
+    return sums_of(weights, 1 / positions - 1, intervals, targets).spread.mean()
 
 
 def keypoint_depth(weights, inverse_t, known, valid, relative_width=losses.KEYPOINT_WIDTH):
     targets = torch.cat([known, (relative_width * known).clamp(min=1e-12)], -1)
-    sums = depth_sums(weights, inverse_t, valid, torch.ones_like(known[:, 0]), targets, 1.0)
+    sums = sums_of(weights, inverse_t, torch.ones_like(known[:, 0]), targets, valid)
     return losses.depth_priors(sums.mass, sums.reached, losses.KEYPOINT_OUTLIERS, sums.reached.sum().clamp(min=1))
 
 
 def depth_priors(weights, inverse_t, known, valid, least_error, outliers=0.02):
     error = (known[:, 1:] ** 2 + least_error**2).sqrt().clamp(min=1e-12)
     targets = torch.cat([known[:, :1], error], -1)
-    sums = depth_sums(weights, inverse_t, valid, torch.ones_like(known[:, 0]), targets, 1.0)
+    sums = sums_of(weights, inverse_t, torch.ones_like(known[:, 0]), targets, valid)
     return losses.depth_priors(sums.mass, sums.reached, outliers, max(1, len(sums.mass)))
 
 
@@ -58,9 +60,10 @@ def test_photometric_is_the_mean_squared_error():
 def point_color(colors, weights, observed):
     """The loss from samples, through the sums that a ray keeps of them."""
     field = MMPIField(random_plan(1, False, 0), shading="sample")
-    field.sample_colors = lambda *_: colors
-    composite = Composite(weights, weights[:, :1], weights[:, :1])
-    _, sums = field.render_colors(None, None, None, composite)
+    field.sample_colors = lambda *_: colors.flatten(0, 1)
+    samples = SimpleNamespace(starts=torch.arange(len(weights) + 1) * weights.shape[1])
+    composite = Composite(weights.flatten(), *[weights[:, :1]] * 3)
+    _, sums = field.render_colors(None, samples, None, composite)
     return losses.point_color(sums.mass, sums.first, sums.second, observed)
 
 
@@ -191,7 +194,7 @@ def test_a_depth_is_at_most_as_exact_as_planes_are_dense_also_of_an_mpi_that_end
     plan = ScenePlan((make_mpi(near=1.0, far=1.25, planes=5),), None, 0.05, 1.0)  # planes 0.05 apart in 1 / depth
     monkeypatch.setattr(losses, "depth_sums", lambda *args: args[4])
     one = torch.ones(1, 1)
-    samples = SimpleNamespace(num_intersected=one[0], inverse_t=one, valid=one > 0)
+    samples = SimpleNamespace(num_intersected=one[0], inverse_t=one, starts=None)
     rays = SimpleNamespace(samples=samples, composite=SimpleNamespace(weights=one), rgb=one)
     bundle = SimpleNamespace(disparities=torch.tensor([[1.0, 0.0]]), keypoint_disparities=None)
     assert losses._depth_sums(rays, bundle, SimpleNamespace(plan=plan))[0, 1].item() == pytest.approx(0.6 * 0.05)

@@ -1,7 +1,9 @@
 """Volume rendering of merged samples in log space (paper sec. III-B): weights, colour, depth, and the winning head.
 
-A sample stores its optical depth tau = -log(1 - alpha), never alpha: at alpha = 1 the slope of log(1 - alpha) is
-infinite, while tau is an ordinary number. All arithmetic is float32 or wider, also under autocast.
+Samples of all rays lie in one array, ray behind ray and nearest first; those of ray r are ``starts[r]:starts[r + 1]``,
+and what lies behind the last ray belongs to none. A sample stores its optical depth tau = -log(1 - alpha), never alpha:
+at alpha = 1 the slope of log(1 - alpha) is infinite, while tau is an ordinary number. All arithmetic is float32 or
+wider, also under autocast.
 """
 
 from __future__ import annotations
@@ -9,24 +11,47 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from mmpi_ns.ops.ends import HALF
 
+MOST = 200.0
+"""Maximum of a number in ``sum_before``: an optical depth behind which nothing is visible in any precision."""
 
-def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
-    """Sum of all earlier samples on the ray. Shifted, not subtracted: x - x loses small terms before a large x."""
-    shifted = torch.nn.functional.pad(values[:, :-1], (1, 0))
-    return shifted.cumsum(-1)
+
+def ray_numbers(starts: Int[Tensor, "R+1"], count: int) -> Int[Tensor, "N"]:
+    """Ray of each of ``count`` samples; R behind the last ray."""
+    counts = torch.cat([starts, starts.new_full((1,), count)]).diff()
+    return torch.repeat_interleave(counts, output_size=count)
+
+
+def sum_by_ray(
+    values: Float[Tensor, "N *C"], starts: Int[Tensor, "R+1"], numbers: Int[Tensor, "N"]
+) -> Float[Tensor, "R *C"]:
+    """Sums over the samples of each ray, with gradients; ``numbers`` are those of ``ray_numbers``."""
+    return values.new_zeros(len(starts), *values.shape[1:]).index_add(0, numbers, values)[:-1]
+
+
+def sum_before(values: Float[Tensor, "N"], starts: Int[Tensor, "R+1"], numbers: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+    """Sum of all earlier samples on the ray, in float64, with gradients.
+
+    It is a difference of sums over all rays. So that no ray spoils the others, numbers beyond ``MOST`` count as that,
+    and what is no number as 0.
+    """
+    total = pad(values.double().nan_to_num(0.0, MOST).clamp(max=MOST).cumsum(0), (1, 0))
+    return total[:-1] - total[starts][numbers]
 
 
 @dataclass(frozen=True)
 class Composite:
-    """Weights of the samples [R, S]; accumulation and transmittance of the rays [R, 1]."""
+    """Weights of the samples [N]; their sums, accumulation and transmittance of the rays [R, 1]."""
 
-    weights: Float[Tensor, "R S"]
+    weights: Float[Tensor, "N"]
     """T_k alpha'_k of the kept samples."""
+    mass: Float[Tensor, "R 1"]
+    """Sum of the weights."""
     accumulation: Float[Tensor, "R 1"]
     """1 - transmittance, with the dropped samples."""
     transmittance: Float[Tensor, "R 1"]
@@ -34,59 +59,68 @@ class Composite:
 
 
 def composite_weights(
-    tau: Float[Tensor, "R S"],
-    valid: Bool[Tensor, "R S"],
-    skipped_before: Float[Tensor, "R S"],
+    tau: Float[Tensor, "N"],
+    starts: Int[Tensor, "R+1"],
+    skipped_before: Float[Tensor, "N"],
     skipped_total: Float[Tensor, "R 1"],
 ) -> Composite:
     """Volume-rendering weights of merged samples, sorted by distance; with gradients to ``tau``.
 
     Args:
         tau: blended optical depths of the samples that were kept.
-        valid: which slots hold a sample.
+        starts: of the rays' samples.
         skipped_before: optical depth of the dropped samples in front of each kept one (a constant).
         skipped_total: optical depth of all dropped samples of the ray.
 
     Returns:
-        Weights T_k (1 - exp(-tau_k)), accumulation and transmittance.
+        Weights T_k (1 - exp(-tau_k)), 0 behind the last ray, and what they add up to.
 
     Source: paper eq. (rendering) and its blended form in sec. III-C.
     """
-    tau = torch.where(valid, tau, 0.0)
-    through = -tau
-    weights = -(torch.exp(exclusive_cumsum(through) - skipped_before) * torch.expm1(through))
-    depth = tau.sum(-1, keepdim=True) + skipped_total
-    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
+    numbers = ray_numbers(starts, len(tau))
+    tau = torch.where(numbers < len(starts) - 1, tau, 0.0)
+    before = sum_before(tau, starts, numbers).to(tau.dtype)
+    weights = -(torch.exp(-before - skipped_before) * torch.expm1(-tau))
+    mass, depth = (sum_by_ray(x.double()[:, None], starts, numbers).to(tau.dtype) for x in (weights, tau))
+    depth = depth + skipped_total
+    return Composite(weights, mass, -torch.expm1(-depth), torch.exp(-depth))
 
 
-def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
+def render_colors(
+    composite: Composite, colors: Float[Tensor, "N 3"], starts: Int[Tensor, "R+1"]
+) -> Float[Tensor, "R 3"]:
     """Colour gathered along each ray, without background, with gradients to weights and colours.
 
     The weight of the dropped samples takes the mean colour of the kept ones (a constant factor per ray), so pruning
     does not darken the image.
     """
-    kept = composite.weights.sum(-1, keepdim=True)
+    kept = composite.mass
     factor = torch.where(kept > 1e-6, composite.accumulation / kept.clamp(min=1e-6), torch.ones_like(kept))
-    return factor.detach() * (composite.weights[..., None] * colors).sum(-2)
+    sums = sum_by_ray(composite.weights[:, None] * colors, starts, ray_numbers(starts, len(colors)))
+    return factor.detach() * sums
 
 
 @torch.no_grad()
 def median_inverse_distance(
-    weights: Float[Tensor, "R S"], inverse_t: Float[Tensor, "R S"], valid: Bool[Tensor, "R S"]
+    weights: Float[Tensor, "N"], inverse_t: Float[Tensor, "N"], starts: Int[Tensor, "R+1"]
 ) -> Float[Tensor, "R 1"]:
     """1/t of the sample at which a ray reaches half of its accumulated weight; 0 (infinity) for an empty ray.
 
     Independent of the other rays, and so of the chunks of an image.
     """
-    gathered = weights.cumsum(-1)
-    total = gathered[:, -1:]
-    reached = (gathered >= HALF * total) & valid & (total > 0)
-    index = reached.to(torch.int8).argmax(-1, keepdim=True)
-    picked = inverse_t.gather(-1, index)
-    return torch.where(reached.any(-1, keepdim=True), picked, torch.zeros_like(picked))
+    numbers = ray_numbers(starts, len(weights))
+    mass = sum_by_ray(weights.double(), starts, numbers)
+    shares = weights / pad(mass, (0, 1), value=1.0)[numbers]
+    # As many samples lie before it as have not reached half, but for roundings.
+    not_reached = sum_before(shares, starts, numbers) + shares < HALF - 1e-9
+    index = starts[:-1] + sum_by_ray(not_reached.long(), starts, numbers)
+    return pad(inverse_t, (0, 1))[torch.where(mass > 0, index.clamp(max=len(weights)), len(weights))][:, None]
 
 
-def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_heads: int) -> Float[Tensor, "R 1"]:
+def winning_heads(
+    weights: Float[Tensor, "N"], heads: Int[Tensor, "N"], starts: Int[Tensor, "R+1"], num_heads: int
+) -> Float[Tensor, "R 1"]:
     """Head with the largest weight on each ray, for nerfstudio's images; the first of equal ones."""
-    mass = weights.new_zeros(len(weights), num_heads).scatter_add(1, heads, weights)
-    return mass.argmax(-1, keepdim=True).to(weights.dtype)
+    mass = weights.new_zeros(len(starts) * num_heads)
+    mass = mass.index_add(0, ray_numbers(starts, len(weights)) * num_heads + heads, weights)
+    return mass.view(-1, num_heads)[:-1].argmax(-1, keepdim=True).to(weights.dtype)

@@ -6,20 +6,18 @@ a sample has the sigmoids of the former and the hyperbolic tangents of the latte
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import call_in_parts, owned_bounds, structs
+from mmpi_ns.ops.build import call_in_parts, owned_bounds
+from mmpi_ns.ops.composite import ray_numbers, sum_by_ray
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.interpolate import interpolate_densely
-from mmpi_ns.ops.layout import Places, SceneLayout
 
 COLORS = 3
 """Channels of a texel that are colours."""
@@ -27,7 +25,7 @@ COLORS = 3
 
 @dataclass(frozen=True)
 class Taps:
-    """Texels that samples read: 4 per sample on planes, or 8 per sample of the cube."""
+    """Texels that samples read (``texel_rows``)."""
 
     positions: Int[Tensor, "N B"]
     """Of the texels in the list of values."""
@@ -57,57 +55,28 @@ def activate(raw: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
 @operation("gpu")
 def gather_taps(
     values: Float[Tensor, "U C"],
-    taps: list[Taps],
-    slots: Int[Tensor, "N"],
-    weights: Float[Tensor, "R S"],
-    chosen: Bool[Tensor, "R"],
+    taps: Taps,
+    starts: Int[Tensor, "R+1"],
+    weights: Float[Tensor, "N"],
+    chosen: Bool[Tensor, "R"] | None = None,
 ) -> RaySums:
     """Sums over the samples of rays, with gradients to ``values``, ``weights`` and the taps' weights.
 
     Args:
         values: texels that the batch reads.
-        taps: of the samples, those on planes first.
-        slots: flat slot of each sample in ``weights``.
+        taps: of the samples.
+        starts: of the rays' samples (``MergedSamples``).
         weights: rendering weights.
-        chosen: rays to sum for; the others get 0.
+        chosen: rays to sum for; the others get 0. None for all.
     """
-    if not taps:
-        return _sums(values.new_zeros(0, values.shape[1]), slots, weights)
-    raw = torch.cat([interpolate_densely(values, t.positions, t.weights) for t in taps])
-    samples = chosen[slots // weights.shape[1]].nonzero()[:, 0]
-    return _sums(raw[samples], slots[samples], weights)
-
-
-def gather_places(
-    layout: SceneLayout, table: Float[Tensor, "T C"], places: Places, weights: Float[Tensor, "R S"]
-) -> RaySums:
-    """Sums over samples at places in the heads, without gradients; ``table`` holds all texels. In plain torch only:
-    ``ops.march`` renders images."""
-    slots, raw = [], []
-    for k, grid in enumerate(layout.grids):
-        slots.append((places.valid & (places.heads == k)).reshape(-1).nonzero()[:, 0])
-        ndc, planes = places.ndc.reshape(-1, 3)[slots[k]], places.planes.reshape(-1)[slots[k]]
-        rows, shares = grid.bilinear(planes, ndc) if k < len(layout.mpis) else grid.trilinear(ndc)
-        raw.append(interpolate_densely(table, rows, shares))
-    return _sums(torch.cat(raw), torch.cat(slots), weights)
-
-
-def _sums(raw: Tensor, slots: Tensor, weights: Tensor) -> RaySums:
-    rays, num_rays = slots // weights.shape[1], weights.shape[0]
-    value, weight = activate(raw), weights.reshape(-1)[slots][:, None]
-    gathered = value.new_zeros(num_rays, raw.shape[1]).index_add(0, rays, weight * value)
-    weight, colors = weight.detach(), value[:, :COLORS]
-    sums = value.new_zeros(num_rays, 7).index_add(0, rays, torch.cat([weight, weight * colors, weight * colors**2], -1))
+    numbers = ray_numbers(starts, len(weights))
+    if chosen is not None:
+        numbers = torch.where(torch.nn.functional.pad(chosen, (0, 1))[numbers], numbers, len(chosen))
+    value = activate(interpolate_densely(values, taps.positions, taps.weights))
+    gathered = sum_by_ray(weights[:, None] * value, starts, numbers)
+    weight, colors = weights.detach()[:, None], value[:, :COLORS]
+    sums = sum_by_ray(torch.cat([weight, weight * colors, weight * colors**2], -1), starts, numbers)
     return RaySums(gathered, sums[:, :1].detach(), sums[:, 1:4], sums[:, 4:])
-
-
-def number_samples(
-    slots: Int[Tensor, "N"], chosen: Bool[Tensor, "R"], weights: Float[Tensor, "R S"]
-) -> Int32[Tensor, "R S"]:
-    """Number of the sample in each slot of the chosen rays; -1 where there is none."""
-    numbers = torch.full(weights.shape, -1, dtype=torch.int32, device=weights.device)
-    numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32, device=weights.device)
-    return numbers.masked_fill_(~chosen[:, None], -1)
 
 
 LANES = 16
@@ -116,26 +85,15 @@ AT_LEAST = 1 << 14
 """Texels read that justify another thread."""
 
 
-def _groups(taps: list[Tensor], to_weights: Sequence[Tensor | None] = (None, None)) -> ctypes.Array:
-    """The taps of planes, then those of the cube, with the gradients of their weights: ``Taps`` of ``gather.cpp``."""
-    groups: list[tuple] = [(None, None, 0, None)] * 2
-    for positions, weights, to in zip(taps[::2], taps[1::2], to_weights, strict=False):
-        groups[positions.shape[1] // 8] = (positions, weights, len(positions), to)
-    return structs(*groups)
-
-
 class _GatherTaps(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, values: Tensor, weights: Tensor, slots: Tensor, chosen: Tensor, *taps: Tensor
+        ctx: Any, values: Tensor, positions: Tensor, shares: Tensor, starts: Tensor, weights: Tensor, chosen: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        (num_rays, width), channels = weights.shape, values.shape[1]
-        saved = [x.contiguous() for x in (values, weights, slots, chosen, *taps)]
-        values, weights, slots, chosen = saved[:4]
-        numbers = number_samples(slots, chosen, weights)
+        num_rays, channels = len(starts) - 1, values.shape[1]
+        saved = [x if x is None else x.contiguous() for x in (values, positions, shares, starts, weights, chosen)]
         sums = torch.empty(num_rays, channels + 1 + COLORS)
-        samples = (_groups(saved[4:]), numbers, weights, width)
-        call_in_parts("mmpi_gather_taps", num_rays, values, *values.shape, *samples, sums)
+        call_in_parts("mmpi_gather_taps", num_rays, *values.shape, shares.shape[1], *saved, sums)
         ctx.save_for_backward(*saved)
         gathered, mass, second = sums.split([channels, 1, COLORS], -1)
         ctx.mark_non_differentiable(mass)
@@ -143,21 +101,22 @@ class _GatherTaps(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        values, weights, slots, chosen, *taps = ctx.saved_tensors
+        values, positions, shares, starts, weights, _ = saved = ctx.saved_tensors
         to_sums, _, to_first, to_second = grad_outputs
         to_values = torch.empty_like(values) if ctx.needs_input_grad[0] else None
+        to_shares = torch.zeros_like(shares) if ctx.needs_input_grad[2] else None
         to_weights = torch.zeros_like(weights)
-        moved = zip(taps[1::2], ctx.needs_input_grad[5::2], strict=True)
-        to_taps = [torch.zeros_like(x) if is_needed else None for x, is_needed in moved]
-        batch = (values, *values.shape, _groups(taps, to_taps), slots, chosen, weights)
         grads = [pad(g, (0, -g.shape[1] % LANES)).contiguous() for g in (to_sums, to_first, 2 * to_second)]
-        bounds = owned_bounds(taps[::2], len(values), AT_LEAST)
-        call_in_parts("mmpi_gather_back", bounds, *batch, *grads, weights.shape[1], to_values, to_weights)
-        return to_values, to_weights, None, None, *(x for to in to_taps for x in (None, to))
+        bounds = owned_bounds([positions], len(values), AT_LEAST)
+        sizes = (*values.shape, shares.shape[1], len(starts) - 1)
+        call_in_parts("mmpi_gather_back", bounds, *sizes, *saved, *grads, to_values, to_shares, to_weights)
+        return to_values, None, to_shares, None, to_weights, None
 
 
 @gather_taps.on_cpu
-def gather_taps_on_cpu(values: Tensor, taps: list[Taps], slots: Tensor, weights: Tensor, chosen: Tensor) -> RaySums:
+def gather_taps_on_cpu(
+    values: Tensor, taps: Taps, starts: Tensor, weights: Tensor, chosen: Tensor | None = None
+) -> RaySums:
     """``gather_taps`` in C++, whose gradients do not depend on the number of threads."""
-    tensors = [x for t in taps for x in (t.positions.to(torch.int32), t.weights)]
-    return RaySums(*_GatherTaps.apply(values, weights, slots, chosen, *tensors))  # type: ignore[misc]
+    samples = (taps.positions.to(torch.int32), taps.weights, starts, weights, chosen)
+    return RaySums(*_GatherTaps.apply(values, *samples))  # type: ignore[misc]

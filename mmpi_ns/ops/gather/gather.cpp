@@ -6,34 +6,17 @@
 
 namespace {
 
-// Rows and weights of the taps of samples: those of planes first, then those of the cube.
+// The texels that samples read, and the samples' weights.
 struct Taps {
+    int64_t taps;
     const int32_t* positions;
-    const float* weights;
-    int64_t count;
-    float* grad_weights; // null: not needed
-};
+    const float *shares, *weights;
 
-// The taps of one sample.
-struct SampleTaps {
-    int taps;
-    const int32_t* positions;
-    const float* weights;
-    float* grad_weights;
-
-    SampleTaps(const Taps* groups, int64_t number) {
-        const bool in_cube = number >= groups[0].count;
-        const Taps& group = groups[in_cube];
-        taps = in_cube ? 8 : 4;
-        const int64_t at = (number - (in_cube ? groups[0].count : 0)) * taps;
-        positions = group.positions + at, weights = group.weights + at;
-        grad_weights = group.grad_weights ? group.grad_weights + at : nullptr;
-    }
-
-    Sample sample(float weight) const {
+    Sample sample(int64_t number) const {
         Sample x;
-        x.taps = taps, x.weight = weight;
-        for (int tap = 0; tap < taps; tap++) x.rows[tap] = positions[tap], x.shares[tap] = weights[tap];
+        x.taps = int(taps), x.weight = weights[number];
+        for (int tap = 0; tap < taps; tap++)
+            x.rows[tap] = positions[number * taps + tap], x.shares[tap] = shares[number * taps + tap];
         return x;
     }
 };
@@ -55,18 +38,19 @@ void gather(const Table& table, const std::vector<Sample>& samples, float* sums)
     for (int c = 0; c < COLORS; c++) sums[table.channels + 1 + c] = squares[c];
 }
 
-// Sums [R, channels + 4] of rays [begin, end): `numbers` [R, S] is the sample in each slot, -1 if there is none. The
-// memory of the next ray is prefetched.
-void mmpi_gather_taps(int64_t begin, int64_t end, const float* values, int64_t rows, int64_t channels,
-                      const Taps* groups, const int32_t* numbers, const float* weights, int64_t slots, float* sums) {
+// Sums [R, channels + 4] of rays [begin, end), 0 of those that are not `chosen` (null: all). The memory of the next ray
+// is prefetched.
+void mmpi_gather_taps(int64_t begin, int64_t end, int64_t rows, int64_t channels, int64_t num_taps, const float* values,
+                      const int32_t* positions, const float* shares, const int64_t* starts, const float* weights,
+                      const bool* chosen, float* sums) {
     const Table table{values, rows, channels};
+    const Taps taps{num_taps, positions, shares, weights};
     std::vector<Sample> samples[2];
     const auto prepare = [&](int64_t ray) {
         std::vector<Sample>& next = samples[ray & 1];
         next.clear();
-        for (int64_t slot = ray * slots; slot < (ray + 1) * slots; slot++) {
-            if (numbers[slot] < 0) continue;
-            next.push_back(SampleTaps(groups, numbers[slot]).sample(weights[slot]));
+        for (int64_t i = starts[ray]; i < starts[ray + 1] && (!chosen || chosen[ray]); i++) {
+            next.push_back(taps.sample(i));
             prefetch(table, next.back());
         }
     };
@@ -77,37 +61,36 @@ void mmpi_gather_taps(int64_t begin, int64_t end, const float* values, int64_t r
     }
 }
 
-// Gradients of values [rows, channels] (null if not needed), of the taps' weights (in the taps, added to what is there)
-// and of weights [R, S] from those of the sums [R, padded] and, except for the weights, of the sums of
-// colours and twice those of squared colours [R, 16], padded with zeros. Samples of rays that are not `chosen` have none.
-// One thread owns rows [begin, end) and adds the samples in the order of `slots`: sums do not depend on the threads.
+// Gradients of values [rows, channels] and of shares (null if not needed; added to what is there) and of weights [N] from
+// those of the sums [R, padded] and, except for the weights, of the sums of colours and twice those of squared colours
+// [R, 16], padded with zeros. Samples of rays that are not `chosen` have none.
+// One thread owns rows [begin, end) and adds the samples in order: sums do not depend on the threads.
 // The owner of a sample's first row writes the other gradients.
-void mmpi_gather_back(int64_t begin, int64_t end, const float* values, int64_t rows, int64_t channels,
-                      const Taps* groups, const int64_t* slots, const bool* chosen, const float* weights,
-                      const float* grad_sums, const float* grad_colors, const float* grad_squares,
-                      int64_t slots_per_ray, float* grad_values, float* grad_weights) {
+void mmpi_gather_back(int64_t begin, int64_t end, int64_t rows, int64_t channels, int64_t num_taps, int64_t num_rays,
+                      const float* values, const int32_t* positions, const float* shares, const int64_t* starts,
+                      const float* weights, const bool* chosen, const float* grad_sums, const float* grad_colors,
+                      const float* grad_squares, float* grad_values, float* grad_shares, float* grad_weights) {
     const Table table{values, rows, channels};
+    const Taps taps{num_taps, positions, shares, weights};
     const auto owns = [&](int32_t row) { return begin <= row && row < end; };
     if (grad_values) std::fill(grad_values + begin * channels, grad_values + end * channels, 0.0f);
-    const int64_t padded = (channels + WIDTH - 1) / WIDTH * WIDTH, count = groups[0].count + groups[1].count;
+    const int64_t padded = (channels + WIDTH - 1) / WIDTH * WIDTH, count = starts[num_rays];
     constexpr int64_t AHEAD = 6;
+    int64_t ray = 0;
     for (int64_t n = 0; n < count; n++) {
-        if (n + AHEAD < count) {
-            const SampleTaps soon(groups, n + AHEAD);
-            for (int tap = 0; tap < soon.taps; tap++) {
-                if (!owns(soon.positions[tap])) continue;
-                table.prefetch(soon.positions[tap]);
-                if (!grad_values) continue;
-                __builtin_prefetch(grad_values + soon.positions[tap] * channels, 1);
-                __builtin_prefetch(grad_values + (soon.positions[tap] + 1) * channels - 1, 1);
-            }
+        for (int64_t tap = 0; n + AHEAD < count && tap < num_taps; tap++) {
+            const int32_t soon = positions[(n + AHEAD) * num_taps + tap];
+            if (!owns(soon)) continue;
+            table.prefetch(soon);
+            if (!grad_values) continue;
+            __builtin_prefetch(grad_values + soon * channels, 1);
+            __builtin_prefetch(grad_values + (soon + 1) * channels - 1, 1);
         }
-        const SampleTaps at(groups, n);
-        if (std::none_of(at.positions, at.positions + at.taps, owns)) continue;
-        const int64_t slot = slots[n], ray = slot / slots_per_ray;
-        if (!chosen[ray]) continue;
-        const Sample sample = at.sample(weights[slot]);
-        const bool is_first = owns(at.positions[0]);
+        while (n >= starts[ray + 1]) ray++;
+        const int32_t* at = positions + n * num_taps;
+        if ((chosen && !chosen[ray]) || std::none_of(at, at + num_taps, owns)) continue;
+        const Sample sample = taps.sample(n);
+        const bool is_first = owns(at[0]);
         Lanes total{};
         for (int64_t first = 0; first < channels; first += WIDTH) {
             const Texel texel = activate(interpolate(table, sample, first), first);
@@ -117,18 +100,17 @@ void mmpi_gather_back(int64_t begin, int64_t end, const float* values, int64_t r
             float down[WIDTH];
             store(down, sample.weight * slope * texel.slope);
             const int64_t size = std::min<int64_t>(WIDTH, channels - first);
-            for (int tap = 0; grad_values && tap < at.taps; tap++)
-                if (owns(at.positions[tap]))
-                    add_row(grad_values + at.positions[tap] * channels + first, down, at.weights[tap], size);
-            for (int tap = 0; is_first && at.grad_weights && tap < at.taps; tap++) {
-                const float* read = values + at.positions[tap] * channels + first;
-                for (int64_t c = 0; c < size; c++) at.grad_weights[tap] += read[c] * down[c];
+            for (int tap = 0; grad_values && tap < num_taps; tap++)
+                if (owns(at[tap])) add_row(grad_values + at[tap] * channels + first, down, sample.shares[tap], size);
+            for (int tap = 0; is_first && grad_shares && tap < num_taps; tap++) {
+                const float* read = values + at[tap] * channels + first;
+                for (int64_t c = 0; c < size; c++) grad_shares[n * num_taps + tap] += read[c] * down[c];
             }
         }
         if (!is_first) continue;
         float sum = 0;
         for (int i = 0; i < WIDTH; i++) sum += total[i];
-        grad_weights[slot] = sum;
+        grad_weights[n] = sum;
     }
 }
 

@@ -5,7 +5,6 @@ A step reads a few of a table's millions of rows. The cost of backward and optim
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 
 from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds
 from mmpi_ns.ops.dispatch import operation
-from mmpi_ns.ops.layout import Places, SceneLayout
+from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
 AT_LEAST = 1 << 15
@@ -66,59 +65,27 @@ class Table(nn.Parameter):
 
 
 @operation()
-def order_by_head(
-    places: Places, num_heads: int, counts: Sequence[int] | None = None, pads: bool = False
-) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "N"], Float[Tensor, "N 3"], Sequence[int]]:
-    """Valid samples of a batch, ordered by head and otherwise by slot.
-
-    Args:
-        places: of the samples.
-        num_heads: of the scene.
-        counts: samples of each head; without it, this synchronises with a GPU.
-        pads: ``counts`` is the capacity of each head; unused places refer to the last slot of the first ray, which is
-            empty then. Samples beyond the capacity are dropped.
-
-    Returns:
-        Flat slots [R, S] of the samples, their heads, planes and NDC, and the number of samples of each head.
-    """
-    heads, valid = places.heads.reshape(-1), places.valid.reshape(-1)
-    if counts is None:
-        parts = [(valid & (heads == k)).nonzero()[:, 0] for k in range(num_heads)]
-        slots, counts = torch.cat(parts), [len(p) for p in parts]
-    else:
-        keys = torch.where(valid, heads, num_heads)
-        ordered, slots = torch.sort(keys.to(torch.int16), stable=True)
-        if pads:
-            first = torch.searchsorted(ordered, torch.arange(num_heads + 1, device=keys.device, dtype=torch.int16))
-            of_heads = torch.cat([torch.full((n,), k, device=keys.device) for k, n in enumerate(counts)])
-            at = first[of_heads] + torch.cat([torch.arange(n, device=keys.device) for n in counts])
-            last = places.valid.shape[1] - 1
-            slots = torch.where(at < first[of_heads + 1], slots[at.clamp(max=len(slots) - 1)], last)
-            return slots, of_heads, places.planes.reshape(-1)[slots], places.ndc.reshape(-1, 3)[slots], counts
-        slots = slots[: sum(counts)]
-    planes, ndc = places.planes.reshape(-1)[slots], places.ndc.reshape(-1, 3)[slots]
-    return slots, heads[slots], planes, ndc, counts
-
-
-@operation()
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
-) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
-    """Rows and weights of the four texels around samples of several MPIs (``TexelGrid.bilinear``), with gradients to
-    ``ndc`` where it requires them.
+) -> tuple[Int[Tensor, "N B"], Float[Tensor, "N B"]]:
+    """Rows and weights of the texels around samples of several heads, with gradients to ``ndc`` where it requires them:
+    four of each sample, or eight where there is a cube (``TexelGrid.trilinear``).
 
     Args:
         layout: of the scene.
-        heads: MPI of each sample.
-        planes: plane of each sample.
-        ndc: position of each sample in its MPI.
+        heads: head of each sample.
+        planes: plane of each sample; of those in the cube any number.
+        ndc: position of each sample in its head.
     """
-    names = ("height", "width", "down", "across", "first_tile")
+    names = ("depth", "height", "width", "down", "across", "first_tile")
     if (sizes := layout.packed.get("sizes")) is None:
         sizes = torch.tensor([[getattr(grid, name) for name in names] for grid in layout.grids], device=heads.device)
         layout.packed["sizes"] = sizes
     of_samples: dict[str, Any] = dict(zip(names, sizes[heads].unbind(-1), strict=True))
-    return replace(layout.grids[0], **of_samples).bilinear(planes, ndc)
+    grid = replace(layout.grids[0], **of_samples)
+    if layout.cube is None:
+        return grid.bilinear(planes, ndc)
+    return grid.trilinear(ndc, planes.masked_fill(heads == len(layout.mpis), -1))
 
 
 @operation()
@@ -224,30 +191,14 @@ class _WeighRows(torch.autograd.Function):
         return to_values, None, to_weights
 
 
-@order_by_head.on_cpu
-def order_by_head_on_cpu(
-    places: Places, num_heads: int, counts: Sequence[int] | None = None, pads: bool = False
-) -> tuple:
-    heads, planes, ndc, valid = (x.contiguous() for x in places)
-    bounds = even_bounds(heads.numel(), AT_LEAST)
-    in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
-    call_in_parts("mmpi_count_heads", bounds, heads, valid, num_heads, in_parts)
-    totals = in_parts.sum(0)
-    starts = totals.cumsum(0) - totals + in_parts.cumsum(0) - in_parts
-    count = int(totals.sum())
-    slots, of_heads, of_planes = torch.empty(3, count, dtype=torch.int64)
-    columns = (slots, of_heads, of_planes, torch.empty(count, 3))
-    call_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
-    return *columns, totals.tolist()
-
-
 @texel_rows.on_cpu
 def texel_rows_on_cpu(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
     if ndc.requires_grad:
         return texel_rows.reference(layout, heads, planes, ndc)
-    rows, weights = torch.empty(len(heads), 4, dtype=torch.int64), torch.empty(len(heads), 4)
-    samples = (x.contiguous() for x in (heads, planes, ndc))
-    call_in_parts("mmpi_texel_rows", len(heads), layout.cpu_grids, *samples, rows, weights, least=AT_LEAST)
+    taps = 4 if layout.cube is None else 8
+    rows, weights = torch.empty(len(heads), taps, dtype=torch.int64), torch.empty(len(heads), taps)
+    samples, scene = (x.contiguous() for x in (heads, planes, ndc)), (layout.cpu_grids, len(layout.mpis), taps)
+    call_in_parts("mmpi_texel_rows", len(heads), *scene, *samples, rows, weights, least=AT_LEAST)
     return rows, weights
 
 

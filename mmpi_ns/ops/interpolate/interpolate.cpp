@@ -66,36 +66,18 @@ void mmpi_sum_rows(int64_t begin, int64_t end, const int32_t* positions, const f
             add_row(values + positions[i] * channels, grad + i / taps * channels, weights[i], channels);
 }
 
-// Counts the samples of each head in slots [begin, end), to the part's `counts` [parts, num_heads].
-void mmpi_count_heads(int64_t begin, int64_t end, const int64_t* heads, const bool* valid, int64_t num_heads,
-                      int64_t* counts) {
-    counts += this_part * num_heads;
-    for (int64_t i = begin; i < end; i++) counts[heads[i]] += valid[i];
-}
-
-// Writes slot, head, plane and position of each sample in slots [begin, end) to the next place of its head; the
-// part's `next` [parts, num_heads] is advanced.
-void mmpi_order_by_head(int64_t begin, int64_t end, const int64_t* heads, const int64_t* planes, const float* ndc,
-                        const bool* valid, int64_t num_heads, int64_t* next, int64_t* slots, int64_t* of_heads,
-                        int64_t* of_planes, float* of_ndc) {
-    next += this_part * num_heads;
-    for (int64_t i = begin; i < end; i++) {
-        if (!valid[i]) continue;
-        const int64_t to = next[heads[i]]++;
-        slots[to] = i, of_heads[to] = heads[i], of_planes[to] = planes[i];
-        std::copy_n(ndc + 3 * i, 3, of_ndc + 3 * to);
-    }
-}
-
-// Rows and weights of bilinear lookups of samples [begin, end) at (u, v, .) of `ndc` on planes of MPIs
-// (TexelGrid.bilinear).
-void mmpi_texel_rows(int64_t begin, int64_t end, const Grid* grids, const int64_t* heads, const int64_t* planes,
-                     const float* ndc, int64_t* rows, float* weights) {
+// Rows and weights of the texels around samples [begin, end); of eight `taps`, the last four of a sample on a plane are
+// the first ones again, with weight 0.
+void mmpi_texel_rows(int64_t begin, int64_t end, const Grid* grids, int64_t num_mpis, int64_t taps,
+                     const int64_t* heads, const int64_t* planes, const float* ndc, int64_t* rows, float* weights) {
     for (int64_t i = begin; i < end; i++) {
         Sample sample;
-        sample.put(grids[heads[i]], false, planes[i], ndc + 3 * i);
-        std::copy_n(sample.rows, 4, rows + 4 * i);
-        std::copy_n(sample.shares, 4, weights + 4 * i);
+        sample.put(grids[heads[i]], heads[i] == num_mpis, planes[i], ndc + 3 * i);
+        for (int tap = 0; tap < taps; tap++) {
+            const bool is_own = tap < sample.taps;
+            rows[taps * i + tap] = sample.rows[is_own ? tap : tap - 4];
+            weights[taps * i + tap] = is_own ? sample.shares[tap] : 0;
+        }
     }
 }
 
@@ -107,6 +89,4 @@ IN_PARTS(mmpi_list_rows)
 IN_PARTS(mmpi_place_rows)
 IN_PARTS(mmpi_weighted_rows)
 IN_PARTS(mmpi_sum_rows)
-IN_PARTS(mmpi_count_heads)
-IN_PARTS(mmpi_order_by_head)
 IN_PARTS(mmpi_texel_rows)

@@ -7,6 +7,7 @@ below the weight of a kept sample), so its cost is that of the samples in front 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,8 +16,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import OPS, call_in_parts, structs
-from mmpi_ns.ops.layout import Places, SceneLayout, Tables, dense, dense_fields
+from mmpi_ns.ops.build import OPS, call_in_parts, even_bounds, structs
+from mmpi_ns.ops.composite import ray_numbers
+from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.scene.bricks import columns_from
 
 
@@ -40,8 +42,7 @@ class Rays(NamedTuple):
 class Capacity(NamedTuple):
     """Capacity for the samples of a training batch, which fixes the sizes of its arrays before the march."""
 
-    slots: int
-    """Slots of each ray; the last one stays empty."""
+    samples: int
     heads: tuple[int, ...]
     """Samples of each head."""
     rows: int
@@ -70,18 +71,19 @@ class MarchOptions(NamedTuple):
 
 @dataclass(frozen=True)
 class MergedSamples:
-    """The kept samples of R rays, nearest first in S slots of each ray, and the attenuation by the pruned ones."""
+    """The kept samples of R rays, ray behind ray and nearest first, and the attenuation by the pruned ones."""
 
-    heads: Int[Tensor, "R S"]
-    """0 in empty slots, like all fields."""
-    planes: Int[Tensor, "R S"]
-    ndc: Float[Tensor, "R S 3"]
-    inverse_t: Float[Tensor, "R S"]
-    tau: Float[Tensor, "R S"]
+    heads: Int[Tensor, "N"]
+    """With a capacity, 0 behind the last ray, like all fields."""
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    inverse_t: Float[Tensor, "N"]
+    tau: Float[Tensor, "N"]
     """Optical depth, blended if reliability is used."""
-    skipped_before: Float[Tensor, "R S"]
+    skipped_before: Float[Tensor, "N"]
     """Optical depth of the dropped samples in front of each sample."""
-    valid: Bool[Tensor, "R S"]
+    starts: Int[Tensor, "R+1"]
+    """Samples of ray r are ``starts[r]:starts[r + 1]``."""
     skipped_total: Float[Tensor, "R 1"]
     dropped_mass: Float[Tensor, "R 1"]
     """Sum of the weights of the dropped samples."""
@@ -95,11 +97,27 @@ class MergedSamples:
     capacity: Capacity | None = None
     """See ``MarchOptions``."""
     numbers: Int[Tensor, "1+H"] | None = None
-    """Largest number of kept samples of a ray, then that of each head; only with a capacity."""
+    """Number of kept samples, of all heads and of each, also of those beyond the capacity; only with one."""
 
-    @property
-    def places(self) -> Places:
-        return Places(self.heads, self.planes, self.ndc, self.valid)
+    @cached_property
+    def rays(self) -> Int[Tensor, "N"]:
+        """Ray of each sample; the last one for those behind it."""
+        return ray_numbers(self.starts, len(self.heads)).clamp(max=max(0, len(self.starts) - 2))
+
+    def by_head(self, num_heads: int, chosen: Bool[Tensor, "R"] | None = None) -> list[Int[Tensor, "n"]]:
+        """Indices of each head's samples on the chosen rays. If their numbers are known, those of all rays, and N where
+        there are fewer, without synchronisation."""
+        count = len(self.heads)
+        if self.head_counts is None:
+            asked = self.heads if chosen is None else torch.where(chosen[self.rays], self.heads, -1)
+            return [(asked == k).nonzero()[:, 0] for k in range(num_heads)]
+        index = torch.arange(count, device=self.heads.device)
+        heads, order = torch.where(index < self.starts[-1], self.heads, num_heads).sort(stable=True)
+        first, parts = torch.searchsorted(heads, torch.arange(num_heads + 1, device=heads.device)), []
+        for k, number in enumerate(self.head_counts):
+            at = first[k] + torch.arange(number, device=heads.device)
+            parts.append(torch.where(at < first[k + 1], order[at.clamp(max=count - 1)], count))
+        return parts
 
 
 def empty_samples(*shape: int, index: torch.dtype = torch.int64, device: torch.device | str = "cpu") -> list[Tensor]:
@@ -135,18 +153,20 @@ def ray_outputs(name: str, num_rays: int, channels: int, *values: Any, folder: P
 
 def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     num_rays, room = len(rays.origins), options.most_kept(layout.most_samples)
-    samples = structs(empty_samples(num_rays * room, index=torch.int32))
-    starts, kept, num_intersected = torch.empty(3, num_rays, dtype=torch.int64)
+    samples, bounds = empty_samples(num_rays * room), even_bounds(num_rays)
+    kept, num_intersected = torch.empty(2, num_rays, dtype=torch.int64)
     fully_covered, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
     walk = (layout.cpu_scene(tables), structs(dense_fields(rays)))
     how = (float(options.threshold), float(options.fair_share), options.blends)
-    outputs = (starts, kept, num_intersected, fully_covered, skipped, dropped, samples)
-    call_in_parts("mmpi_march", num_rays, *walk, room, *how, *outputs)
-    width = max(1, int(kept.max())) if num_rays else 1
-    slots = [*empty_samples(num_rays, width), torch.empty(num_rays, width, dtype=torch.bool)]
-    call_in_parts("mmpi_pack", num_rays, starts, kept, width, samples, structs(slots))
+    outputs = (kept, num_intersected, fully_covered, skipped, dropped, structs(samples))
+    call_in_parts("mmpi_march", bounds, *walk, room, *how, *outputs)
+    starts = pad(kept.cumsum(0), (1, 0))
+    # Each part has left its samples in one piece.
+    firsts, counts = [room * first for first in bounds[:-1]], starts[bounds].diff().tolist()
+    pieces = [[x[i : i + n] for i, n in zip(firsts, counts, strict=True)] for x in samples]
     return MergedSamples(
-        *slots,
+        *(torch.cat(each) if len(each) > 1 else each[0] for each in pieces),
+        starts=starts,
         skipped_total=skipped,
         dropped_mass=dropped,
         num_intersected=num_intersected,

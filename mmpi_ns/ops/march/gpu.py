@@ -16,8 +16,10 @@ import triton
 import triton.language as tl
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from mmpi_ns.ops import ends
+from mmpi_ns.ops.composite import ray_numbers
 from mmpi_ns.ops.gather.gpu import activate, sizes
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
@@ -89,7 +91,7 @@ def march_kernel(
     HAS_CUBE: tl.constexpr, ALLOWS: tl.constexpr, CHOOSES: tl.constexpr, BLENDS: tl.constexpr, KEEP_ALL: tl.constexpr,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    """Kept samples of ray r, written from r * room on. ``numbers``: largest number of a ray, then that of each head."""
+    """Kept samples of ray r, written from r * room on. ``numbers``: those of each head."""
     row, head_of = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, HEADS)
     exists = row < num_rays
     ray = tl.where(exists, row, 0)
@@ -130,8 +132,7 @@ def march_kernel(
     tl.store(kept + row, number_kept, exists)
     tl.store(skipped_total + row, skipped, exists)
     tl.store(dropped_mass + row, dropped, exists)
-    tl.atomic_max(numbers, tl.max(number_kept, 0), sem="relaxed")
-    tl.atomic_add(numbers + 1 + head_of, of_heads, head_of < K + HAS_CUBE, sem="relaxed")
+    tl.atomic_add(numbers + head_of, of_heads, head_of < K + HAS_CUBE, sem="relaxed")
 
 
 @triton.jit
@@ -211,15 +212,14 @@ class Slots(NamedTuple):
     dropped_mass: Float[Tensor, "R 1"]
     num_intersected: Int[Tensor, "R"]
     fully_covered: Bool[Tensor, "R 1"]
-    numbers: Int[Tensor, "1+H"]
-    """Largest number of kept samples of a ray, then that of each head."""
+    numbers: Int[Tensor, "H"]
+    """Number of kept samples of each head."""
 
 
 def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
     """``march`` up to the slots that are then packed or summed."""
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
-    threshold, capacity = float(options.threshold), options.capacity
-    room = options.most_kept(layout.most_samples) if capacity is None else capacity.slots
+    threshold, room = float(options.threshold), options.most_kept(layout.most_samples)
     # If all heads may render, the placeholder of the choice is not read.
     parts = [rays.origins if x is None else x for x in dense_fields(rays)]
     m = Slots(
@@ -229,7 +229,7 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
         dropped_mass=torch.empty(num_rays, 1, device=device),
         num_intersected=torch.empty(num_rays, dtype=torch.int64, device=device),
         fully_covered=torch.empty(num_rays, 1, dtype=torch.bool, device=device),
-        numbers=torch.zeros(1 + num_heads, dtype=torch.int32, device=device),
+        numbers=torch.zeros(num_heads, dtype=torch.int32, device=device),
     )
     heads, (head_rows, biases, cube_row) = triton.next_power_of_2(num_heads), layout.constants
     at_once = block_size(max(1, min(RAYS, RANGES // heads)), device)
@@ -248,16 +248,17 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """``sampler.march`` on a GPU, which synchronises once, to size the result, unless a capacity is given."""
     m, capacity = march_into_slots(layout, tables, rays, options), options.capacity
-    if capacity is None:
-        widest, *of_heads = m.numbers.tolist()
-        kept, width = m.kept, max(1, widest)
-    else:
-        of_heads, width, kept = capacity.heads, capacity.slots, m.kept.clamp(max=capacity.slots - 1)
-    valid = torch.arange(width, device=m.kept.device) < kept[:, None]
-    packed = (torch.where(valid.view(valid.shape + (1,) * (x.ndim - 2)), x[:, :width], 0) for x in m.samples)
-    heads, planes, *others = packed
-    of_rays = (m.skipped_total, m.dropped_mass, m.num_intersected, m.fully_covered, tuple(of_heads))
-    return MergedSamples(heads.long(), planes.long(), *others, valid, *of_rays, capacity, m.numbers)
+    of_heads = tuple(m.numbers.tolist()) if capacity is None else capacity.heads
+    count = sum(of_heads) if capacity is None else capacity.samples
+    starts = pad(m.kept.cumsum(0), (1, 0)).clamp(max=count)
+    owner, room = ray_numbers(starts, count), m.samples[0].shape[1]
+    filled = owner < len(m.kept)
+    slots = torch.where(filled, owner * room + torch.arange(count, device=starts.device) - starts[owner], 0)
+    flat = (x.flatten(0, 1)[slots] for x in m.samples)
+    heads, planes, *others = (torch.where(filled.view(-1, *[1] * (x.ndim - 1)), x, 0) for x in flat)
+    numbers = torch.cat([m.numbers.sum(0, keepdim=True), m.numbers])
+    of_rays = (m.skipped_total, m.dropped_mass, m.num_intersected, m.fully_covered, of_heads)
+    return MergedSamples(heads.long(), planes.long(), *others, starts, *of_rays, capacity, numbers)
 
 
 def render_fused(

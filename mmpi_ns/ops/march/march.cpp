@@ -116,21 +116,13 @@ void fill_cube(Run& run, const Scene& scene, const Packet& rays, int ray, bool s
     finish(run, cube.interval);
 }
 
-template <typename Int> struct Samples {
-    Int *heads, *planes;
-    float *ndc, *inverse_t, *tau, *skipped_before;
-};
-
-struct Packed : Samples<int64_t> {
-    bool* valid;
-};
-
 // Kept samples, one ray behind the other.
-struct Slots : Samples<int32_t> {
-    int64_t size;
+struct Samples {
+    int64_t *heads, *planes;
+    float *ndc, *inverse_t, *tau, *skipped_before;
 
-    void keep(const Run& run, int64_t head, float depth, float skipped) {
-        heads[size] = int32_t(head), planes[size] = run.plane[run.at];
+    void keep(const Run& run, int64_t head, float depth, float skipped, int64_t& size) const {
+        heads[size] = head, planes[size] = run.plane[run.at];
         for (int a = 0; a < 3; a++) ndc[3 * size + a] = run.ndc[run.at][a];
         inverse_t[size] = run.inverse_t[run.at], tau[size] = depth, skipped_before[size] = skipped;
         size++;
@@ -144,7 +136,8 @@ class Training {
           waiting(scene.num_heads), nearest(scene.num_heads) {}
 
     // Marches one of sixteen rays.
-    void march(const Packet& rays, const Crossings& crossings, int ray, Slots& to, float& skipped, float& dropped) {
+    void march(const Packet& rays, const Crossings& crossings, int ray, const Samples& to, int64_t& size, float& skipped,
+               float& dropped) {
         int64_t num_waiting = 0;
         for (int64_t h = 0; h < scene.num_heads; h++) {
             const bool in_cube = h == scene.num_mpis;
@@ -176,7 +169,7 @@ class Training {
             }
             const float weight = transmittance * (1 - pass);
             if (weight > bounds.weight)
-                to.keep(run, h, tau, skipped);
+                to.keep(run, h, tau, skipped, size);
             else
                 skipped += tau, dropped += weight;
             transmittance *= pass;
@@ -211,47 +204,25 @@ class Training {
 };
 
 // Marches rays [begin, end), each of which keeps `room` samples at most. Kept samples are written one ray behind the
-// other, from begin * room on; their first index to starts[ray], their number to kept[ray].
+// other, from begin * room on; their number to kept[ray].
 void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, int64_t room, float threshold,
-                float fair_share, bool blends, int64_t* starts, int64_t* kept, int64_t* intersected, bool* covered,
-                float* skipped_total, float* dropped_mass, const Samples<int32_t>* samples) {
+                float fair_share, bool blends, int64_t* kept, int64_t* intersected, bool* covered, float* skipped_total,
+                float* dropped_mass, const Samples* samples) {
     Training training(*scene, threshold, fair_share, blends);
     Crossings crossings;
-    Slots slots{*samples, begin * room};
+    int64_t size = begin * room;
     for (int64_t first = begin; first < end; first += WIDTH) {
         const Packet packet(*rays, first, std::min<int64_t>(WIDTH, end - first));
         crossings.cross(*scene, *rays, packet);
         for (int64_t ray = first; ray < std::min(first + WIDTH, end); ray++) {
-            starts[ray] = slots.size;
-            training.march(packet, crossings, int(ray - first), slots, skipped_total[ray], dropped_mass[ray]);
-            kept[ray] = slots.size - starts[ray];
+            kept[ray] = -size;
+            training.march(packet, crossings, int(ray - first), *samples, size, skipped_total[ray], dropped_mass[ray]);
+            kept[ray] += size;
             intersected[ray] = crossings.total[ray - first], covered[ray] = crossings.fully_covered[ray - first];
         }
-    }
-}
-
-// Copies the kept samples of rays [begin, end) into `width` slots each; the rest of the slots is 0.
-void mmpi_pack(int64_t begin, int64_t end, const int64_t* starts, const int64_t* kept, int64_t width,
-               const Samples<int32_t>* from, const Packed* to) {
-    // Array by array, so that copies and zeros (most slots, where one ray keeps many) go a cache line at a time.
-    const auto pack = [](const auto* from, int64_t size, int64_t room, auto* to) {
-        std::copy_n(from, size, to);
-        std::fill_n(to + size, room - size, 0);
-    };
-    for (int64_t ray = begin; ray < end; ray++) {
-        const int64_t put = ray * width, at = starts[ray], size = kept[ray];
-        pack(from->heads + at, size, width, to->heads + put);
-        pack(from->planes + at, size, width, to->planes + put);
-        pack(from->ndc + 3 * at, 3 * size, 3 * width, to->ndc + 3 * put);
-        pack(from->inverse_t + at, size, width, to->inverse_t + put);
-        pack(from->tau + at, size, width, to->tau + put);
-        pack(from->skipped_before + at, size, width, to->skipped_before + put);
-        std::fill_n(to->valid + put, size, true);
-        std::fill_n(to->valid + put + size, width - size, false);
     }
 }
 
 } // namespace
 
 IN_PARTS(mmpi_march)
-IN_PARTS(mmpi_pack)

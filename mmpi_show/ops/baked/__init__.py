@@ -49,14 +49,15 @@ def render_baked(
         peaks.view(-1).scatter_reduce_(0, texels.flatten(), each.flatten().to(peaks), "amax")
     kept = weights > threshold
     weights = torch.where(kept, weights, 0.0)
+    starts = torch.arange(len(weights) + 1) * weights.shape[1]
     mass, transmittance = weights.sum(-1, keepdim=True), torch.where(transmittance > OPAQUE_BAKED, transmittance, 0.0)
     outputs = (
         torch.from_numpy(reader.gather(window, samples, kept.numpy())),
         mass,
         transmittance,
         1 - transmittance,
-        median_inverse_distance(weights, inverse_t, kept),
-        winning_heads(weights, heads, len(scene.mpis)),
+        median_inverse_distance(weights.flatten(), inverse_t.flatten(), starts),
+        winning_heads(weights.flatten(), heads.flatten(), starts, len(scene.mpis)),
         (1 - transmittance - mass).clamp(min=0),
     )
     return RayOutputs(*(x.to(rays.origins) for x in outputs))
