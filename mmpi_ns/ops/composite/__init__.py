@@ -9,13 +9,17 @@ wider, also under autocast.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from mmpi_ns.ops.build import call_in_parts
+from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import HALF
+from mmpi_ns.ops.layout import dense
 
 MOST = 200.0
 """Maximum of a number in ``sum_before``: an optical depth behind which nothing is visible in any precision."""
@@ -58,6 +62,7 @@ class Composite:
     """Behind the last sample."""
 
 
+@operation()
 def composite_weights(
     tau: Float[Tensor, "N"],
     starts: Int[Tensor, "R+1"],
@@ -83,6 +88,29 @@ def composite_weights(
     weights = -(torch.exp(-before - skipped_before) * torch.expm1(-tau))
     mass, depth = (sum_by_ray(x.double()[:, None], starts, numbers).to(tau.dtype) for x in (weights, tau))
     depth = depth + skipped_total
+    return Composite(weights, mass, -torch.expm1(-depth), torch.exp(-depth))
+
+
+class _CompositeWeights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, tau: Tensor, starts: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, ...]:
+        (weights, behind), (mass, depth) = torch.zeros(2, len(tau)), torch.empty(2, *total.shape)
+        call_in_parts("mmpi_composite", len(total), tau, starts, before, total, weights, behind, mass, depth)
+        ctx.save_for_backward(starts, weights, behind)
+        return weights, mass, depth
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        starts, weights, behind = ctx.saved_tensors
+        grads, gradient = (x.contiguous() for x in grad_outputs), torch.zeros_like(weights)
+        call_in_parts("mmpi_composite_back", len(starts) - 1, starts, weights, behind, *grads, gradient)
+        return gradient, None, None, None
+
+
+@composite_weights.on_cpu
+def composite_weights_on_cpu(tau: Tensor, starts: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
+    tensors = (*dense(tau), starts.contiguous(), *dense(skipped_before, skipped_total))
+    weights, mass, depth = _CompositeWeights.apply(*tensors)  # type: ignore[misc]
     return Composite(weights, mass, -torch.expm1(-depth), torch.exp(-depth))
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.composite import ray_numbers, sum_before, sum_by_ray
+from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.layout import dense
 
 REACH = 3.0
 """Widths within which a sample reaches the target of its ray."""
@@ -25,6 +28,7 @@ class DepthSums(NamedTuple):
     """Whether the ray has a target and a sample within three widths of it."""
 
 
+@operation()
 def depth_sums(
     weights: Float[Tensor, "N"],
     inverse_t: Float[Tensor, "N"],
@@ -62,3 +66,30 @@ def depth_sums(
     # A quadratic form of the weights is half of their product with its gradient.
     twice, mass = (sum_by_ray(weights * x, starts, numbers) for x in (slope, window))
     return DepthSums(twice - 0.5 * twice.detach(), mass, (within > 0) & (targets[:, 0] > 0))
+
+
+class _DepthSums(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, inverse_t: Tensor, starts: Tensor, *rays: Any) -> tuple[Tensor, ...]:
+        slope, window = torch.zeros_like(weights), torch.zeros_like(weights)
+        (spread, mass), reached = torch.empty(2, len(starts) - 1), torch.empty(len(starts) - 1, dtype=torch.bool)
+        sums = (spread, mass, reached, slope, window)
+        call_in_parts("mmpi_depth_sums", len(spread), weights, inverse_t, starts, *rays, REACH**2, *sums)
+        ctx.save_for_backward(starts, slope, window)
+        ctx.mark_non_differentiable(reached)
+        return spread, mass, reached
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        starts, slope, window = ctx.saved_tensors
+        grads, gradient = (x.contiguous() for x in grad_outputs[:2]), torch.zeros_like(slope)
+        call_in_parts("mmpi_depth_sums_back", len(starts) - 1, starts, slope, window, *grads, gradient)
+        return gradient, None, None, None, None, None
+
+
+@depth_sums.on_cpu
+def depth_sums_on_cpu(
+    weights: Tensor, inverse_t: Tensor, starts: Tensor, intervals: Tensor, targets: Tensor, scale: float
+) -> DepthSums:
+    tensors = (*dense(weights, inverse_t), starts.contiguous(), *dense(intervals, targets))
+    return DepthSums(*_DepthSums.apply(*tensors, float(scale)))  # type: ignore[misc]
