@@ -171,7 +171,7 @@ class MMPIModelConfig(ModelConfig):
     eval_num_rays_per_chunk: int = 0
     """Rays in a rendering chunk; 0 chooses for the device (on a GPU: as many as fit in half of its free memory)."""
     size: float = 1.0
-    """Factor on training rays and maximum texels relative to the defaults for the capture: 0.3 for a quick look, 4 for
+    """Factor on training rays and maximum texels where they follow the capture (``mmpi``): 0.3 for a quick look, 4 for
     the best field."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Placement and resolution of the MPIs."""
