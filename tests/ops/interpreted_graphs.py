@@ -152,7 +152,7 @@ def test_a_step_that_does_not_fit_changes_nothing_and_the_next_one_has_room(scen
     for step in range(2 + MEASURED):  # the first steps are of their own kind
         run(step)
     room = graphs.capacity
-    graphs.capacity = room._replace(samples=room.samples - step_graph.MORE - 20)
+    graphs.capacity = room._replace(samples=(room.samples - step_graph.MORE) // 2)
     before, repeated = [p.data.clone() for p in graphs.model.field.parameters()], graphs.repeated
     run(2 + MEASURED)
     assert graphs.repeated == repeated + 1
