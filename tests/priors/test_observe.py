@@ -154,7 +154,7 @@ def test_a_mask_leaves_out_the_keypoints_on_its_black_pixels():
     tracks = with_tracks(bare(), model((0, 0, 0.7, 0.1), (0, 1, 0.1, 0.7), (1, 2, 0.7, 0.1), (1, 3, 0.999, 0.999)))
     masks = [np.ones((20, 40), bool), np.ones((60, 80), bool)]
     masks[0][10:, :20] = False
-    data = as_data(usable=lambda i: masks[i], has_masks=True)
+    data = as_data(usable=lambda i: masks[i], has_masks=True, has_alpha=False)
     actual = drop_masked(tracks, data)
     assert actual.seen_point.tolist() == [0, 2, 3] and len(actual.seen_at) == 3
 
