@@ -146,8 +146,8 @@ class SharedPoints:
         """The points shared by two of the given images, which have a share of all pixels; None if there is none."""
         images, cover = images.to(self.pixels), self.cover / len(self.pixels) / share
         shared = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
-        columns = (x[shared] for x in (self.pixels, self.other, self.colors, self.depths))
-        return SharedPoints(*columns, self.centers, cover * len(shared)) if len(shared) else None
+        pixels, other, colors, depths = (x[shared] for x in (self.pixels, self.other, self.colors, self.depths))
+        return SharedPoints(pixels, other, colors, depths, self.centers, cover * len(shared)) if len(shared) else None
 
     def draw(
         self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
