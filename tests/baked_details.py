@@ -28,7 +28,7 @@ def training_cameras(scene: BakedScene) -> Cameras:
     pose = torch.tensor(scene.path[0].to_world)
     poses = pose.repeat(3, 1, 1)
     for i, (x, y) in enumerate([(0.03, 0.0), (-0.05, 0.03), (0.02, -0.05)]):
-        poses[i, :, 3] += x * pose[:, 0] + y * pose[:, 1]
+        poses[i, :, 3] += x * pose[:, 0] + y * pose[:, 1] + 0.12 * i * pose[:, 2]  # the later ones farther behind
     kinds = torch.tensor([kind.value for kind in KINDS])
     return Cameras(poses, 38.0, 41.0, 25.5, 18.5, WIDTH, HEIGHT, torch.tensor(LENSES), camera_type=kinds)
 
