@@ -32,6 +32,10 @@ FLAGS = [
 ]
 
 
+class TabError(AssertionError):
+    """The browser refused a command."""
+
+
 class Tab:
     """One tab, and what its console said."""
 
@@ -48,7 +52,8 @@ class Tab:
         while True:
             answer = json.loads(self._socket.recv(timeout=120))
             if answer.get("id") == number:
-                assert "error" not in answer, answer
+                if "error" in answer:
+                    raise TabError(answer)
                 return answer["result"]
             self._note(answer)
 
