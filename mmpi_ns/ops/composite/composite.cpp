@@ -7,7 +7,7 @@
 namespace {
 
 // e^-x, and 0 where that is no normal number: thousands of samples lie behind an opaque one.
-inline Lanes passed(Lanes x) { return x < 87.0f ? exp_lanes(-x) : Lanes{}; }
+inline Lanes passed(Lanes x) { return pick(x < 87.0f, exp_lanes(-x), Lanes{}); }
 
 // 1 - e^-x for x >= 0, exact also where it is small. NaN stays NaN.
 inline Lanes absorbed(Lanes x) {
@@ -18,7 +18,7 @@ inline Lanes absorbed(Lanes x) {
     p = p * x + 1.0f / 24;
     p = p * x - 1.0f / 6;
     p = p * x + 0.5f;
-    return x > 0.25f ? 1.0f - exp_lanes(-x) : x - x * x * p;
+    return pick(x > 0.25f, 1.0f - exp_lanes(-x), x - x * x * p);
 }
 
 // Weights of the samples of rays [begin, end), and transmittance behind each of them; their sum and the optical depth of

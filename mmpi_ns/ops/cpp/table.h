@@ -22,11 +22,18 @@ inline Octet load_octet(const float* from) {
 }
 
 inline Lanes join(Octet a, Octet b) {
-    return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    Lanes x;
+    __builtin_memcpy(x.pieces, &a, sizeof a), __builtin_memcpy(reinterpret_cast<char*>(x.pieces) + sizeof a, &b, sizeof b);
+    return x;
 }
 
-inline Octet lower_half(Lanes x) { return __builtin_shufflevector(x, x, 0, 1, 2, 3, 4, 5, 6, 7); }
-inline Octet upper_half(Lanes x) { return __builtin_shufflevector(x, x, 8, 9, 10, 11, 12, 13, 14, 15); }
+inline Octet half_of(const Lanes& x, int which) {
+    Octet half;
+    __builtin_memcpy(&half, reinterpret_cast<const char*>(x.pieces) + which * sizeof half, sizeof half);
+    return half;
+}
+inline Octet lower_half(Lanes x) { return half_of(x, 0); }
+inline Octet upper_half(Lanes x) { return half_of(x, 1); }
 
 // to += share * from.
 inline void add_row(float* to, const float* from, float share, int64_t channels) {

@@ -52,9 +52,9 @@ struct Texel {
 // Colours are sigmoids and features hyperbolic tangents, of sixteen numbers of these channels. NaN stays NaN.
 inline Texel activate(Lanes raw, Lanes channels) {
     const Mask is_color = channels < float(COLORS);
-    const Lanes share = 1.0f / (1.0f + exp_lanes(is_color ? -raw : -2.0f * raw));
-    const Lanes rest = share * (1.0f - share), value = is_color ? share : 2.0f * share - 1.0f;
-    return {raw == raw ? value : raw, is_color ? rest : 4.0f * rest};
+    const Lanes share = 1.0f / (1.0f + exp_lanes(pick(is_color, -raw, -2.0f * raw)));
+    const Lanes rest = share * (1.0f - share), value = pick(is_color, share, 2.0f * share - 1.0f);
+    return {pick(raw == raw, value, raw), pick(is_color, rest, 4.0f * rest)};
 }
 
 inline Texel activate(Lanes raw, int64_t first) { return activate(raw, IOTA + float(first)); }

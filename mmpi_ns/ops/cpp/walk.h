@@ -101,7 +101,7 @@ template <int CELLS> struct Walks {
         const Lanes leaving = float(stack.planes - 1) + least(leaves(x_last, x_step, x_turns, at_left),
                                                               leaves(y_last, y_step, y_turns, at_top));
         IntLanes end = least(last, at_word * WORD + (WORD - 1));
-        end = leaving < real(end) ? most(l, truncated(leaving)) : end;
+        end = pick(leaving < real(end), most(l, truncated(leaving)), end);
         const IntLanes before = ~(whole(-1) << (l & 31)), within = ~(whole(-2) << (end & 31));
         left = pick(searching, at_left, left), top = pick(searching, at_top, top);
         word = pick(searching, at_word, word), exit = pick(searching, end, exit);
@@ -115,8 +115,8 @@ template <int CELLS> struct Walks {
 
     // Planes behind the last one at which rays leave a tile along one axis; a ray parallel to it never does.
     static Lanes leaves(Lanes last, Lanes step, Lanes turns, IntLanes lower) {
-        const Lanes end = real(lower + (step > 0 ? whole(CELLS) : IntLanes{}));
-        return step == 0 ? splat(std::numeric_limits<float>::infinity()) : (end - last) * turns;
+        const Lanes end = real(lower + pick(step > 0, whole(CELLS), IntLanes{}));
+        return pick(step == 0, splat(std::numeric_limits<float>::infinity()), (end - last) * turns);
     }
 };
 
@@ -211,7 +211,7 @@ template <typename Texels> class Walker {
             Lanes top = next(0);
             IntLanes best{};
             for (int32_t h = 1; h < scene.num_heads; h++) { // ties: the first head
-                best = next(h) > top ? whole(h) : best;
+                best = pick(next(h) > top, whole(h), best);
                 top = most(next(h), top);
             }
             const Mask active = (top >= 0) & ~(transmittance <= least_transmittance); // not is_terminated

@@ -95,7 +95,7 @@ void mmpi_gather_back(int64_t begin, int64_t end, int64_t rows, int64_t channels
         for (int64_t first = 0; first < channels; first += WIDTH) {
             const Texel texel = activate(interpolate(table, sample, first), first);
             Lanes slope = load(grad_sums + ray * padded + first);
-            total += IOTA < float(channels - first) ? slope * texel.value : Lanes{};
+            total += pick(IOTA < float(channels - first), slope * texel.value, Lanes{});
             if (first == 0) slope += load(grad_colors + ray * WIDTH) + load(grad_squares + ray * WIDTH) * texel.value;
             float down[WIDTH];
             store(down, sample.weight * slope * texel.slope);

@@ -57,8 +57,8 @@ void add_row(Group& group, const Surroundings& at, int64_t row) {
 
 // Adds scale * Huber(center - other) and its slope. NaN stays NaN.
 void add_difference(Lanes center, Lanes other, float scale, Lanes& slope, Lanes& value) {
-    const Lanes difference = center - other, below = difference > 1.0f ? splat(1) : difference;
-    const Lanes clamped = below < -1.0f ? splat(-1) : below;
+    const Lanes difference = center - other, below = pick(difference > 1.0f, splat(1), difference);
+    const Lanes clamped = pick(below < -1.0f, splat(-1), below);
     slope += scale * clamped;
     value += scale * clamped * (difference - 0.5f * clamped);
 }
@@ -66,7 +66,7 @@ void add_difference(Lanes center, Lanes other, float scale, Lanes& slope, Lanes&
 // Slopes with the part along chroma (three colours less their mean) weighted `times` times more (weigh_chroma).
 Lanes weigh_chroma(Lanes slope, float times) {
     const float mean = (slope[0] + slope[1] + slope[2]) / COLORS;
-    return IOTA < float(COLORS) ? slope + times * (slope - mean) : slope;
+    return pick(IOTA < float(COLORS), slope + times * (slope - mean), slope);
 }
 
 // Lanes are channels, sixteen at a time. `grad` has room for sixteen numbers more than it takes.
@@ -81,7 +81,7 @@ Lanes vary(const Table& table, const Group& group, const float* scale, float chr
                 add_difference(center, table.read(group.rows[i][k + 1] * channels + first), scale[k / 2], slope, value);
             if (chroma > 0 && first == 0) slope = weigh_chroma(slope, chroma);
             store(grad + i * channels + first, slope); // the next row overwrites what lies beyond this one
-            total += IOTA < float(channels - first) ? value : Lanes{};
+            total += pick(IOTA < float(channels - first), value, Lanes{});
         }
     return total;
 }

@@ -11,7 +11,7 @@ namespace {
 // 1 / sqrt(x) to 1e-6, for x >= 1e-20.
 Lanes inverse_root(Lanes x) {
 #ifdef __AVX512F__
-    const Lanes rough = Lanes(_mm512_rsqrt14_ps(__m512(x)));
+    const Lanes rough = Lanes::of([](FloatPiece a) { return FloatPiece(_mm512_rsqrt14_ps(__m512(a))); }, x);
     return rough * (1.5f - 0.5f * x * rough * rough);
 #endif
     return 1.0f / root(x);

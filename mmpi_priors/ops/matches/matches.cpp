@@ -81,7 +81,7 @@ void mmpi_solve_matches(int64_t begin, int64_t end, const float* x, const float*
             const Lanes sure = squared / (depth * depth * noise);
             const Mask finite = (magnitude(q) < INFINITY) & (magnitude(sure) < INFINITY);
             const Mask near = (depth > LEAST_AHEAD) & (off_line < farthest_squared);
-            const Mask counts = __builtin_convertvector(load_some<ByteLanes>(usable + i, count), IntLanes) != 0;
+            const Mask counts = widened(load_some<ByteLanes>(usable + i, count)) != 0;
             const Mask kept = counts & near & finite;
             store_some(inverse + i, pick(kept, q, Lanes{}), count);
             store_some(certainty + i, pick(kept, sure, Lanes{}), count);

@@ -9,7 +9,7 @@ namespace {
 // 1 / x to 1e-7, for x >= 1e-12.
 Lanes reciprocal(Lanes x) {
 #ifdef __AVX512F__
-    const Lanes rough = Lanes(_mm512_rcp14_ps(__m512(x)));
+    const Lanes rough = Lanes::of([](FloatPiece a) { return FloatPiece(_mm512_rcp14_ps(__m512(a))); }, x);
     return rough * (2.0f - x * rough);
 #endif
     return 1.0f / x;

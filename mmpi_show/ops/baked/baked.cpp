@@ -7,7 +7,6 @@ namespace {
 
 constexpr int FINENESS = 8, COLORS = 3;
 constexpr int32_t CORNERS[4] = {0, 1, 8, 9}; // of a cell, texels within a brick
-typedef uint16_t ShortLanes __attribute__((vector_size(32)));
 
 struct BakedScene {
     int64_t num_mpis, channels;
@@ -19,26 +18,21 @@ struct BakedScene {
     const float *low, *step;         // of sixteen channels; features' doubled, for tanh x = 2 sigmoid(2 x) - 1
 };
 
-// By way of 16 bits: GCC 12 takes bytes apart one by one to make floats of them, for a quarter of a frame's time.
-inline Lanes widened(ByteLanes codes) {
-    return real(__builtin_convertvector(__builtin_convertvector(codes, ShortLanes), IntLanes));
-}
-
-inline Lanes widened(const uint8_t* from) {
+inline Lanes decoded(const uint8_t* from) {
     ByteLanes codes;
     __builtin_memcpy(&codes, from, sizeof codes);
-    return widened(codes);
+    return real(widened(codes));
 }
 
 // Eight bytes each.
-inline Lanes widened(const uint8_t* left, const uint8_t* right) {
+inline Lanes decoded(const uint8_t* left, const uint8_t* right) {
     typedef uint64_t Words __attribute__((vector_size(16)));
     Words words;
     __builtin_memcpy(&words, left, 8);
     uint64_t upper;
     __builtin_memcpy(&upper, right, 8);
     words[1] = upper;
-    return widened((ByteLanes)words);
+    return real(widened((ByteLanes)words));
 }
 
 struct Bytes {
@@ -97,7 +91,7 @@ struct Bytes {
         for (int i = 0; peaks && i < WIDTH; i++)
             for (const int32_t corner : CORNERS) {
                 int32_t* const peak = reinterpret_cast<int32_t*>(peaks + reads.texel[i] + corner);
-                const int32_t own = ((IntLanes)weight)[i];
+                const int32_t own = as_int(weight)[i];
                 int32_t so_far = __atomic_load_n(peak, __ATOMIC_RELAXED);
                 while (so_far < own && !__atomic_compare_exchange_n(peak, &so_far, own, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
                 }
@@ -115,17 +109,17 @@ struct Bytes {
     Lanes colors(const Lookup& at, int64_t) const {
         const float gx = 1 - at.fx, gy = 1 - at.fy;
         const uint8_t* texel = baked.texels + at.texel * channels;
-        return activated(widened(texel) * (gx * gy) + widened(texel + channels) * (at.fx * gy) +
-                             widened(texel + 8 * channels) * (gx * at.fy) + widened(texel + 9 * channels) * (at.fx * at.fy),
+        return activated(decoded(texel) * (gx * gy) + decoded(texel + channels) * (at.fx * gy) +
+                             decoded(texel + 8 * channels) * (gx * at.fy) + decoded(texel + 9 * channels) * (at.fx * at.fy),
                          low, range, IOTA);
     }
 
     Lanes colors(const Lookup& a, const Lookup& b) const {
         const uint8_t *left = baked.texels + a.texel * OCTET, *right = baked.texels + b.texel * OCTET;
         const Lanes fx = either(a.fx, b.fx), fy = either(a.fy, b.fy), gx = 1 - fx, gy = 1 - fy;
-        return activated(widened(left, right) * (gx * gy) + widened(left + OCTET, right + OCTET) * (fx * gy) +
-                             widened(left + 8 * OCTET, right + 8 * OCTET) * (gx * fy) +
-                             widened(left + 9 * OCTET, right + 9 * OCTET) * (fx * fy),
+        return activated(decoded(left, right) * (gx * gy) + decoded(left + OCTET, right + OCTET) * (fx * gy) +
+                             decoded(left + 8 * OCTET, right + 8 * OCTET) * (gx * fy) +
+                             decoded(left + 9 * OCTET, right + 9 * OCTET) * (fx * fy),
                          low_twice, range_twice, EIGHT_TWICE);
     }
 
