@@ -5,7 +5,7 @@
 #pragma once
 #include "lanes.h"
 
-constexpr int64_t AHEAD = 8; // rows that are prefetched
+constexpr int64_t AHEAD = 32; // rows that are prefetched
 
 template <typename T> inline void prefetch_row(const T* row, int64_t channels) {
     const char* end = reinterpret_cast<const char*>(row + channels);

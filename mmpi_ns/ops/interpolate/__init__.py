@@ -138,6 +138,12 @@ def weigh_rows(
 
 
 @operation(in_cpp=AT_LEAST)
+def chosen_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
+    """Values of ``read_rows``."""
+    return table.index_select(0, rows)
+
+
+@operation(in_cpp=AT_LEAST)
 def weighted_rows(
     table: Float[Tensor, "T C"], rows: Int32[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
@@ -168,7 +174,7 @@ class _ReadRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Table, rows: Tensor) -> Tensor:
         ctx.table, ctx.rows = table, rows
-        return table.data.index_select(0, rows)
+        return chosen_rows(table.data, rows)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[None, None]:

@@ -43,6 +43,15 @@ void mmpi_place_rows(int64_t begin, int64_t end, const int64_t* rows, const uint
     }
 }
 
+// table[rows] at entries [begin, end).
+void mmpi_chosen_rows(int64_t begin, int64_t end, const float* table, const int64_t* rows, int64_t, int64_t channels,
+                      int64_t, float* values) {
+    for (int64_t i = begin; i < end; i++) {
+        if (i + AHEAD < end) prefetch_row(table + rows[i + AHEAD] * channels, channels);
+        std::copy_n(table + rows[i] * channels, channels, values + i * channels);
+    }
+}
+
 // The sum of weights[n, b] * table[positions[n, b]] over b, of samples [begin, end).
 void mmpi_weighted_rows(int64_t begin, int64_t end, const float* numbers, const int32_t* positions,
                         const float* weights, int64_t rows, int64_t channels, int64_t, int64_t taps, float* values) {
@@ -87,6 +96,7 @@ IN_PARTS(mmpi_mark_rows)
 IN_PARTS(mmpi_count_rows)
 IN_PARTS(mmpi_list_rows)
 IN_PARTS(mmpi_place_rows)
+IN_PARTS(mmpi_chosen_rows)
 IN_PARTS(mmpi_weighted_rows)
 IN_PARTS(mmpi_sum_rows)
 IN_PARTS(mmpi_texel_rows)
