@@ -38,13 +38,16 @@ class Variant:
     options: tuple[str, ...] = ()
     seeds: tuple[int, ...] = (0,)
     name: str = "defaults"
-    group: str = "captures"
+    table: str = "defaults"
+    """Name in ``TABLES``."""
 
     @property
     def key(self) -> str:
         return f"{self.capture} /{self.factor}, {self.method}, {self.name}"
 
 
+TABLES = {"defaults": "Defaults", "lengths": "Longer and shorter", "paper": "The paper's methods"}
+"""Titles of the tables by the names of their files; each is made on one commit."""
 STREET = ("kitti-street", 4)
 VARIANTS = (
     Variant(*STREET, seeds=(0, 1, 2)),
@@ -54,7 +57,7 @@ VARIANTS = (
     Variant("room-walk", 2),
     Variant("phone-walk", 2),
     *(
-        Variant(*scene, options=("--max-num-iterations", str(n)), name=f"{n:,} steps", group="length")
+        Variant(*scene, options=("--max-num-iterations", str(n)), name=f"{n:,} steps", table="lengths")
         for scene, lengths in (
             (STREET, (300, 600, 1250, 10_000)),
             (("kitti-street", 1), (1000, 16_000)),
@@ -66,14 +69,14 @@ VARIANTS = (
         for n in lengths
     ),
     *(
-        Variant(*STREET, "mmpi-kitti", (*PAPER, *options), name=name, group="paper")
+        Variant(*STREET, "mmpi-kitti", (*PAPER, *options), name=name, table="paper")
         for name, options in (
             ("one MPI (front), joint", (FACES, "front", *JOINT)),
             ("four MPIs, joint", JOINT),
             ("four MPIs, each alone, then reliability", ()),
         )
     ),
-    Variant("kitti-street", 1, "mmpi-kitti", PAPER[2:], name="all 40,000 steps, of 1,024 rays", group="paper"),
+    Variant("kitti-street", 1, "mmpi-kitti", PAPER[2:], name="all 40,000 steps, of 1,024 rays", table="paper"),
 )
 
 
@@ -85,22 +88,25 @@ class Results(Bench):
     data: Path = Path("captures")
     """Folder with the captures."""
     only: str = ""
-    """Run only variants whose key or group contains this."""
+    """Run only variants whose key or table contains this."""
 
     name = "results"
 
     def run(self) -> None:
-        report = Report(self, self.key("only", "data"))
-        for variant in VARIANTS:
-            if self.only in f"{variant.group}: {variant.key}":
+        for name in TABLES:
+            asked = [v for v in VARIANTS if v.table == name and self.only in f"{name}: {v.key}"]
+            if not asked:
+                continue
+            report = Report(self, self.key("only", "data"), name)
+            for variant in asked:
                 for seed in variant.seeds:
                     report.row(f"{variant.key}, seed {seed}", lambda v=variant, s=seed: self._row(v, s), needed=False)
-        report.content["headline"] = {f"{slug(key)}_psnr": r["psnr"] for key, r in finished(report.content).items()}
-        report.save()
-        scored = read_json(self.output / "score.json")
-        draw(self.output / "results.png", report.content, scored)
-        fill(self.output / "README.md", {"results": results_page(report.content, scored)})
-        fill(ROOT / "README.md", {"results": readme_table(report.content, scored)})
+            report.content["headline"] = {f"{slug(key)}_psnr": r["psnr"] for key, r in finished(report.content).items()}
+            report.save()
+        made, scored = read_tables(self.output), read_json(self.output / "score.json")
+        draw(self.output / "results.png", made, scored)
+        fill(self.output / "README.md", {"results": results_page(made)})
+        fill(ROOT / "README.md", {"results": readme_table(made, scored)})
 
     def _row(self, variant: Variant, seed: int) -> Row:
         if not (self.data / variant.capture / "transforms.json").is_file():
@@ -111,7 +117,7 @@ class Results(Bench):
         scene = Scene(self.data / variant.capture, variant.factor)
         _, results, made = train_and_evaluate(scene, folder, variant.method, options, renders, self.cores)
         row = {k: results[k] for k in ("psnr", "ssim", "field_psnr", "field_ssim", "num_rays_per_sec") if k in results}
-        row |= {"key": variant.key, "group": variant.group, "capture": f"{variant.capture} /{variant.factor}"}
+        row |= {"key": variant.key, "capture": f"{variant.capture} /{variant.factor}"}
         row |= {"name": f"`{variant.method}`" + (f", {variant.name}" if variant.name != "defaults" else "")}
         print(f"{variant.key}, seed {seed}: {row['psnr']:.2f} dB, {row['ssim']:.3f}", flush=True)
         return row | made | {"command": " ".join(["ns-train", variant.method, *options])}
@@ -120,16 +126,20 @@ class Results(Bench):
 # Tables --------------------------------------------------------------------------------------------------------------
 
 
+def read_tables(folder: Path) -> dict[str, Row]:
+    """The files of all tables that were made, by name."""
+    return {name: content for name in TABLES if (content := read_json(folder / f"{name}.json"))}
+
+
 def finished(content: Row) -> dict[str, Row]:
     return {key: row for key, row in content["rows"].items() if "not_run" not in row}
 
 
-def means(content: Row, *groups: str) -> list[Row]:
-    """Rows of some groups, several seeds as their means with standard deviations."""
+def means(content: Row) -> list[Row]:
+    """Rows of a table, several seeds as their means with standard deviations."""
     rows: dict[str, list[Row]] = {}
     for row in finished(content).values():
-        if row["group"] in groups:
-            rows.setdefault(row["key"], []).append(row)
+        rows.setdefault(row["key"], []).append(row)
     merged = []
     for same in rows.values():
         row = dict(same[0])
@@ -146,10 +156,10 @@ def peers(scored: Row, capture: str) -> list[Row]:
     return [r for r in scored.get("rows", {}).values() if r["scene"] == capture and r["seconds"]]
 
 
-def readme_table(content: Row, scored: Row) -> str:
+def readme_table(made: dict[str, Row], scored: Row) -> str:
     """The captures of README.md, with the best of other programs on the same test images."""
     lines = []
-    for row in means(content, "captures"):
+    for row in means(made["defaults"]):
         others = peers(scored, row["capture"]) + peers(scored, row["capture"].replace(" ", "-undistorted "))
         best = max(others, key=lambda r: r["psnr"], default=None)
         other = f"{best['psnr']:.2f} / {best['ssim']:.3f} ({best['seconds']:.0f} s)" if best else ""
@@ -164,7 +174,7 @@ def readme_table(content: Row, scored: Row) -> str:
     return table(columns, lines)
 
 
-def results_page(content: Row, scored: Row) -> str:
+def results_page(made: dict[str, Row]) -> str:
     """All tables of docs/results/README.md."""
     columns = {
         "capture": "{capture}",
@@ -176,15 +186,14 @@ def results_page(content: Row, scored: Row) -> str:
         "GiB": "{gib:.1f}",
         "rendering, rays/s": "{num_rays_per_sec:.0f}",
     }
-    done = finished(content)
-    missing = [v.key for v in VARIANTS if not all(f"{v.key}, seed {seed}" in done for seed in v.seeds)]
-    blocks = [stamp_line(content["made"])]
-    for title, group in (("Defaults", "captures"), ("Longer and shorter", "length"), ("The paper's methods", "paper")):
-        if rows := means(content, group):
-            blocks += [f"**{title}**", table(columns, rows)]
+    blocks = []
+    for name, content in made.items():
+        done, stamp = finished(content), stamp_line(content["made"])
+        blocks += [f"**{TABLES[name]}**", *([stamp] if stamp not in blocks else []), table(columns, means(content))]
+        of_table = (v for v in VARIANTS if v.table == name)
+        if missing := [v.key for v in of_table if not all(f"{v.key}, seed {seed}" in done for seed in v.seeds)]:
+            blocks += [f"Not run: {'; '.join(missing)}."]
     blocks += ["![PSNR and SSIM over seconds](results.png)"]
-    if missing:
-        blocks += [f"Not run: {'; '.join(missing)}."]
     return "\n\n".join(blocks)
 
 
@@ -203,16 +212,17 @@ def fill(page: Path, parts: dict[str, str]) -> None:
     page.write_text(text, encoding="utf-8")
 
 
-def draw(path: Path, content: Row, scored: Row) -> None:
+def draw(path: Path, made: dict[str, Row], scored: Row) -> None:
     """PSNR and SSIM over seconds of training on one capture: ours by length, and other programs."""
     capture = f"{STREET[0]} /{STREET[1]}"
-    ours = [r for r in means(content, "captures", "length", "paper") if r["capture"] == capture]
-    lengths = sorted((r for r in ours if r["group"] != "paper"), key=lambda r: r["processor_seconds"])
+    ours = {name: [r for r in means(content) if r["capture"] == capture] for name, content in made.items()}
+    paper = ours.pop("paper", [])
+    lengths = sorted((r for rows in ours.values() for r in rows), key=lambda r: r["processor_seconds"])
     if not lengths:
         return
     kinds: tuple[tuple[str, list[Row], str, str], ...] = (
         ("mmpi, more and more steps", lengths, "o-", "processor_seconds"),
-        ("mmpi-kitti (paper)", [r for r in ours if r["group"] == "paper"], "s", "processor_seconds"),
+        ("mmpi-kitti (paper)", paper, "s", "processor_seconds"),
         ("OpenSplat", peers(scored, capture), "^", "seconds"),
     )
     ticks = (30, 60, 120, 300, 600, 1200, 3600)
