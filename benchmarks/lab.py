@@ -13,11 +13,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from apart import environment_of
 from report import Bench, Row, commit, processor, read_json
 from trainers import Scene, clock
+
+import mmpi_priors.ops
+from mmpi_ns.ops import build
+from mmpi_ns.utils.files import cache_folder
 
 
 @dataclass(kw_only=True)
@@ -56,8 +61,8 @@ class Used:
     """Most memory of its process."""
 
 
-def run_command(words: list[str], log: Path, threads: int) -> Used:
-    """Runs a command to its end; what it prints goes to a log.
+def run_command(words: list[str], log: Path, threads: int, **variables: str) -> Used:
+    """Runs a command to its end, with some variables of its environment; what it prints goes to a log.
 
     Raises:
         ValueError: it failed; names the log.
@@ -65,7 +70,9 @@ def run_command(words: list[str], log: Path, threads: int) -> Used:
     log.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     with log.open("w", encoding="utf-8") as stream:
-        process = subprocess.Popen(words, stdout=stream, stderr=subprocess.STDOUT, env=environment_of(threads))
+        process = subprocess.Popen(
+            words, stdout=stream, stderr=subprocess.STDOUT, env=environment_of(threads) | variables
+        )
         _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
@@ -78,13 +85,23 @@ def train_and_evaluate(
 ) -> tuple[Path, dict[str, Any], dict[str, Any]]:
     """``ns-train`` with some options, and ``ns-eval`` with what is asked, as a user types them; logs are in the folder.
 
+    The cache is empty but for the compiled operations, so that priors are computed.
+
     Returns:
         The run's folder, the results of ns-eval, and for the row: what training took, threads, machine and commit.
     """
     train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
     place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
     size = ["--data", str(scene.data), "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
-    used = run_command([train, method, *place, *options, *size], folder / "train.log", threads)
+    with TemporaryDirectory() as cache:
+        for operations in (build.OPS, Path(mmpi_priors.ops.__file__).parent):
+            build.library(operations)
+            library = build.library_file(operations)
+            copied = Path(cache, cache_folder().name, library.name)
+            copied.parent.mkdir(exist_ok=True)
+            copied.symlink_to(library)
+        command = [train, method, *place, *options, *size]
+        used = run_command(command, folder / "train.log", threads, XDG_CACHE_HOME=cache)
     run, results = folder / "run" / method / "1", folder / "eval.json"
     words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(results), *asked]
     run_command(words, folder / "eval.log", threads)
