@@ -59,10 +59,7 @@ void mmpi_adam_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t cha
         };
         int64_t first = 0;
         for (; first + OCTET <= channels; first += OCTET) step(first, std::integral_constant<int64_t, OCTET>{});
-        if (channels == 1)
-            step(0, std::integral_constant<int64_t, 1>{});
-        else if (first < channels)
-            step(first, channels - first);
+        for (; first < channels; first++) step(first, std::integral_constant<int64_t, 1>{});
     }
 }
 
