@@ -2,7 +2,7 @@
 #pragma once
 #include <cmath>
 #include <cstdint>
-#ifdef __AVX__
+#ifdef __AVX2__
 #include <immintrin.h>
 #endif
 
@@ -10,7 +10,7 @@ constexpr int WIDTH = 16;
 // Of GCC's and Clang's vectors: GCC compares and chooses among the numbers of a wider one one by one.
 #if defined(__AVX512F__)
 constexpr int NATIVE = 16;
-#elif defined(__AVX__)
+#elif defined(__AVX2__)
 constexpr int NATIVE = 8;
 #else
 constexpr int NATIVE = 4;
@@ -120,7 +120,7 @@ inline uint32_t bits(Mask where) {
     for (int i = 0; i < PIECES; i++) {
 #if defined(__AVX512F__)
         all = _mm512_test_epi32_mask(__m512i(where.pieces[i]), __m512i(where.pieces[i]));
-#elif defined(__AVX__)
+#elif defined(__AVX2__)
         all |= uint32_t(_mm256_movemask_ps(__m256(where.pieces[i]))) << NATIVE * i;
 #else
         for (int k = 0; k < NATIVE; k++) all |= uint32_t(where.pieces[i][k] & 1) << (NATIVE * i + k);
