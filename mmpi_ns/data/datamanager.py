@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,12 +27,13 @@ from mmpi_ns.data.rays import CameraRays, TrainingRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, log
-from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import Generators, generator
 
 Batch = tuple[TrainingRays, dict[str, Any]]
 CAPTURE = "capture"
 """Key of the ``Capture`` in the data set's metadata, by which nerfstudio hands it to the model."""
+AT_ONCE = 8
+"""Steps whose rays are drawn together on a CPU."""
 MANY_DEPTHS = 0.4
 """Minimum share of the training pixels with a depth prior for training to start from surfaces: two thirds have one in
 most captures, a fifth if images hardly overlap."""
@@ -82,8 +82,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     """Draws training batches from ``RaySources`` and hands the capture's priors to the model."""
 
     config: MMPIDataManagerConfig
-    _thread: ClassVar = ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
-    """Thread that draws the rays of the next step during this one: small torch operations, which use one core."""
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.priors: Priors | None = None
@@ -95,8 +93,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
         self.draws = Generators(config.seed, kwargs.get("device", "cpu"))
-        self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
-        """Rays of the next step with their sources, step and number."""
+        self._drawn: tuple[RaySources, tuple[int, int], Batch] | None = None
+        """Rays of some steps with their sources, number of the steps and number of rays."""
         parser: Any = config.dataparser
         factor = getattr(parser, "downscale_factor", None)
         if isinstance(factor, float) and factor.is_integer():  # ns-render dataset gives 2.0
@@ -229,24 +227,26 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(**loaders)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``; several threads draw the next's, too.
+        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``. On a CPU, rays of ``AT_ONCE`` steps are
+        drawn together: drawing is a hundred small operations, and their number is its cost.
 
         Outside training (ns-export always requests step 0) only pixel rays, different ones in each call.
         """
         self.train_count += 1
         if self.sources is None:  # no window was chosen
             self.use_cameras(None)
-        sources, batch = self.sources, None
+        sources, place = self.sources, 0
         pixel_rays = max(1, round(self.share_of_rays * self.get_train_rays_per_batch()))
         assert sources is not None
-        draw, seed, device = partial(sources.draw, pixel_rays), self.config.seed, self.device
         if not self.training:
-            return draw(generator(seed, self.train_count, "pixels", device), pixels_alone=True)
-        if self._ahead is not None:
-            source, key, future = self._ahead
-            batch = future.result() if source is sources and key == (step, pixel_rays) else None
-        batch = batch or draw(self.draws.of(step, "pixels"))
-        if num_threads() > 1 and torch.device(device).type == "cpu":
-            future = self._thread.submit(draw, generator(seed, step + 1, "pixels", device))
-            self._ahead = sources, (step + 1, pixel_rays), future
-        return batch
+            g = generator(self.config.seed, self.train_count, "pixels", self.device)
+            rays, batch = sources.draw(pixel_rays, g, pixels_alone=True)
+        elif torch.device(self.device).type == "cpu":
+            number, place = divmod(step, AT_ONCE)
+            if self._drawn is None or self._drawn[0] is not sources or self._drawn[1] != (number, pixel_rays):
+                drawn = sources.draw(pixel_rays, self.draws.of(number, "pixels"), steps=AT_ONCE)
+                self._drawn = sources, (number, pixel_rays), drawn
+            rays, batch = self._drawn[2]
+        else:
+            rays, batch = sources.draw(pixel_rays, self.draws.of(step, "pixels"))
+        return rays[place], {name: values[place] for name, values in batch.items()}

@@ -182,37 +182,42 @@ class RaySources:
         return pixel_rays, new_view_rays, keypoint_rays
 
     def draw(
-        self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
+        self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False, steps: int = 1
     ) -> tuple[TrainingRays, dict[str, Tensor]]:
-        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and their batch.
+        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and their batch, for some steps.
 
         Returns:
-            The rays. The batch: ``image``, colours of the rays of pixels and new views, at the exposure of the field
-            [R, C], and ``indices``, image, row and column of the pixels [N, 3].
+            The rays [S, R]. The batches: ``image``, colours of the rays of pixels and new views, at the exposure of the
+            field [S, I, C], and ``indices``, image, row and column of the pixels [S, N, 3].
         """
-        colors, indices, depths = self.pixels.draw(pixel_rays, g)
+        colors, indices, depths = self.pixels.draw(steps * pixel_rays, g)
         if self.exposures is not None:
             colors[:, :3] /= self.exposures[indices[:, 0]]
-        bundles, device = [self.rays(indices)], colors.device
+        bundles, images, device = [self.rays(indices)], [colors], colors.device
+        priors = [torch.cat([torch.zeros_like(depths[:, :1]), depths], -1)]  # of keypoints, and of other surfaces
         _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays)
         if self.new_views is not None and new_view_rays:
-            views, seen, distances = self.new_views.draw(new_view_rays, self.rays, g, self.exposures)
+            views, seen, depths = self.new_views.draw(steps * new_view_rays, self.rays, g, self.exposures)
             bundles.append(views)
-            colors, depths = torch.cat([colors, seen]), torch.cat([depths, distances])
-        at_keypoints = torch.zeros(len(colors), 1, device=device)
+            images.append(seen)
+            priors.append(torch.cat([torch.zeros_like(depths[:, :1]), depths], -1))
         if self.keypoints is not None and keypoint_rays:
-            chosen = torch.randint(len(self.keypoints), (keypoint_rays,), generator=g, device=g.device)
+            chosen = torch.randint(len(self.keypoints), (steps * keypoint_rays,), generator=g, device=g.device)
             drawn = self.keypoints[chosen.to(device)]
             bundles.append(drawn)
-            at_keypoints = torch.cat([at_keypoints, cast(Tensor, drawn.keypoint_disparities)])
-            depths = torch.cat([depths, depths.new_zeros(keypoint_rays, 2)])
+            priors.append(torch.nn.functional.pad(cast(Tensor, drawn.keypoint_disparities), (0, 2)))
+
+        def joined(parts: list[Tensor]) -> Tensor:
+            return torch.cat([part.view(steps, -1, part.shape[-1]) for part in parts], 1)
+
         fields = ("origins", "directions", "pixel_area", "camera_indices")
-        joined: dict[str, Any] = {name: torch.cat([getattr(bundle, name) for bundle in bundles]) for name in fields}
+        columns: dict[str, Any] = {name: joined([getattr(bundle, name) for bundle in bundles]) for name in fields}
+        keypoints, depths = joined(priors).split([1, 2], -1)
         rays = TrainingRays(
-            **joined,
-            keypoint_disparities=at_keypoints,
-            disparities=depths,
-            exposures=None if self.exposures is None else self.exposures[joined["camera_indices"][:, 0]],
-            through_pixel=(torch.arange(len(depths), device=device) < len(indices))[:, None],
+            **columns,
+            keypoint_disparities=keypoints.contiguous(),
+            disparities=depths.contiguous(),
+            exposures=None if self.exposures is None else self.exposures[columns["camera_indices"][..., 0]],
+            through_pixel=(torch.arange(keypoints.shape[1], device=device) < pixel_rays)[:, None].expand(steps, -1, 1),
         )
-        return rays, {"image": colors, "indices": indices}
+        return rays, {"image": joined(images), "indices": joined([indices])}

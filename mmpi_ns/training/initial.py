@@ -108,10 +108,10 @@ def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:
     votes = Votes(*(torch.zeros(size, device=field.density.device) for size in sizes))
     for i in range(BATCHES):
         rays, batch = sources.draw(BATCH, generator(seed, i, "initial", field.density.device))
-        count = len(batch["image"])
+        rays, images = rays[0], batch["image"][0]
         assert rays.disparities is not None
-        depths = rays.disparities[:count]
+        depths = rays.disparities[: len(images)]
         measured = (depths[:, 0] > 0).nonzero()[:, 0]
-        parts = rays.origins[measured], rays.directions[measured], depths[measured], batch["image"][measured, :3]
+        parts = rays.origins[measured], rays.directions[measured], depths[measured], images[measured, :3]
         votes.add(field.layout, *parts, field.plan.ray_near)
     start_from_votes(field, votes)

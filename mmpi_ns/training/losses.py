@@ -39,11 +39,10 @@ def photometric(
         exposure: of each ray's image. Errors are those in the image; where it is clipped, a brighter scene costs
             nothing. None: all are equal.
     """
-    error = predicted - observed
-    if exposure is not None:
-        clipped = observed * exposure > CLIPPED
-        error = exposure * torch.where(clipped, error.clamp(max=0), error)
-    return (error**2).mean()
+    if exposure is None:
+        return torch.nn.functional.mse_loss(predicted, observed)
+    error, clipped = predicted - observed, observed * exposure > CLIPPED
+    return ((exposure * torch.where(clipped, error.clamp(max=0), error)) ** 2).mean()
 
 
 def point_color(
@@ -63,7 +62,7 @@ def point_color(
 def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]:
     """Entropy of the transmittance behind the last sample: a ray should be either opaque or empty (L_bg)."""
     p = transmittance.clamp(1e-6, 1 - 1e-6)
-    return -(p * p.log() + (1 - p) * (1 - p).log()).mean()
+    return (torch.special.entr(p) + torch.special.entr(1 - p)).mean()
 
 
 def depth_priors(

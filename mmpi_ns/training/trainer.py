@@ -192,7 +192,7 @@ class MMPITrainer(Trainer):
         bundle, _ = sources.draw(AGREEMENT_RAYS, g)
         forming = not progress.schedule.sharpened(progress.step)
         options = march_options(model.config.sampling, field.plan, forming, field.blends)
-        return disagreement(field, bounded(bundle, field.plan), options)
+        return disagreement(field, bounded(bundle[0], field.plan), options)
 
     def train_iteration(self, step: int) -> Any:
         """One step; records that it ran, and saves a window of several after its last step."""
