@@ -217,6 +217,8 @@ def draw(path: Path, made: dict[str, Row], scored: Row) -> None:
     capture = f"{STREET[0]} /{STREET[1]}"
     ours = {name: [r for r in means(content) if r["capture"] == capture] for name, content in made.items()}
     paper = ours.pop("paper", [])
+    if len({content["made"]["processor"] for name, content in made.items() if name in ours}) > 1:
+        del ours["defaults"]  # seconds of two processors are no line
     lengths = sorted((r for rows in ours.values() for r in rows), key=lambda r: r["processor_seconds"])
     if not lengths:
         return

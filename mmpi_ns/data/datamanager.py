@@ -244,7 +244,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         elif torch.device(self.device).type == "cpu":
             number, place = divmod(step, AT_ONCE)
             if self._drawn is None or self._drawn[0] is not sources or self._drawn[1] != (number, pixel_rays):
-                drawn = sources.draw(pixel_rays, self.draws.of(number, "pixels"), steps=AT_ONCE)
+                steps = range(number * AT_ONCE, (number + 1) * AT_ONCE)
+                drawn = sources.draw(pixel_rays, *(generator(self.config.seed, i, "pixels") for i in steps))
                 self._drawn = sources, (number, pixel_rays), drawn
             rays, batch = self._drawn[2]
         else:

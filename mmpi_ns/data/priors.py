@@ -23,6 +23,7 @@ from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.posed_images import camera_observations
 from mmpi_ns.data.rays import Rays
 from mmpi_ns.placement.observations import Observations
+from mmpi_ns.utils.random_draws import random_numbers
 
 Codes = NDArray[np.int16]
 UNKNOWN, OCTAVE = -(2**15), 1024
@@ -150,15 +151,20 @@ class SharedPoints:
         return SharedPoints(pixels, other, colors, depths, self.centers, cover * len(shared)) if len(shared) else None
 
     def draw(
-        self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
+        self,
+        count: int,
+        rays: Rays,
+        generators: Sequence[torch.Generator],
+        exposures: Float[Tensor, "M 3"] | None = None,
     ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
-        """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
+        """``count`` random rays of each generator from between cameras, with their colours and the inverse distances of
+        their points with errors.
 
         Colours are divided by the ``exposures`` of all training images; None: they are equal.
         """
         device = self.pixels.device
-        chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
-        share = torch.rand(count, 1, generator=g, device=g.device).to(device)
+        chosen = random_numbers(len(self.pixels), count, generators).to(device)
+        share = torch.cat([torch.rand(count, 1, generator=g, device=g.device) for g in generators]).to(device)
         first = rays(self.pixels[chosen].long())
         depths, colors = self.depths[chosen], self.colors[chosen].float() / 255
         if exposures is not None:

@@ -19,7 +19,7 @@ from mmpi_ns.data.rays import Rays, TrainingRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.parallel import in_order
-from mmpi_ns.utils.random_draws import generator
+from mmpi_ns.utils.random_draws import generator, random_numbers
 
 
 @dataclass(frozen=True)
@@ -90,17 +90,17 @@ class PixelPool:
         return int((self.ends - self.begins).sum())
 
     def draw(
-        self, count: int, g: torch.Generator
+        self, count: int, *generators: torch.Generator
     ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
-        """Colours, (image, row, column) and depths of ``count`` random pixels."""
+        """Colours, (image, row, column) and depths of ``count`` random pixels of each generator."""
         after = (self.ends - self.begins).cumsum(0)
-        drawn = torch.randint(self.count, (count,), generator=g, device=g.device).to(self.colors.device)
+        drawn = random_numbers(self.count, count, generators).to(self.colors.device)
         which = torch.searchsorted(after, drawn, right=True)
         chosen = drawn - after[which] + self.ends[which]
         place = chosen - self.begins[which] if self.places is None else self.places[chosen].long()
         width = self.widths[which]
         indices = torch.stack([self.images[which], place // width, place % width], -1)
-        nothing = torch.zeros(count, 2, device=self.colors.device)
+        nothing = torch.zeros(len(drawn), 2, device=self.colors.device)
         depths = nothing if self.depths is None else unpacked(self.depths[chosen])
         return self.colors[chosen].float() / 255, indices, depths
 
@@ -182,28 +182,29 @@ class RaySources:
         return pixel_rays, new_view_rays, keypoint_rays
 
     def draw(
-        self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False, steps: int = 1
+        self, pixel_rays: int, *generators: torch.Generator, pixels_alone: bool = False
     ) -> tuple[TrainingRays, dict[str, Tensor]]:
-        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and their batch, for some steps.
+        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and their batch, for S steps with
+        a generator each.
 
         Returns:
             The rays [S, R]. The batches: ``image``, colours of the rays of pixels and new views, at the exposure of the
             field [S, I, C], and ``indices``, image, row and column of the pixels [S, N, 3].
         """
-        colors, indices, depths = self.pixels.draw(steps * pixel_rays, g)
+        steps = len(generators)
+        colors, indices, depths = self.pixels.draw(pixel_rays, *generators)
         if self.exposures is not None:
             colors[:, :3] /= self.exposures[indices[:, 0]]
         bundles, images, device = [self.rays(indices)], [colors], colors.device
         priors = [torch.cat([torch.zeros_like(depths[:, :1]), depths], -1)]  # of keypoints, and of other surfaces
         _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays)
         if self.new_views is not None and new_view_rays:
-            views, seen, depths = self.new_views.draw(steps * new_view_rays, self.rays, g, self.exposures)
+            views, seen, depths = self.new_views.draw(new_view_rays, self.rays, generators, self.exposures)
             bundles.append(views)
             images.append(seen)
             priors.append(torch.cat([torch.zeros_like(depths[:, :1]), depths], -1))
         if self.keypoints is not None and keypoint_rays:
-            chosen = torch.randint(len(self.keypoints), (steps * keypoint_rays,), generator=g, device=g.device)
-            drawn = self.keypoints[chosen.to(device)]
+            drawn = self.keypoints[random_numbers(len(self.keypoints), keypoint_rays, generators).to(device)]
             bundles.append(drawn)
             priors.append(torch.nn.functional.pad(cast(Tensor, drawn.keypoint_disparities), (0, 2)))
 

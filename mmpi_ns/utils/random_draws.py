@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 
 def generator(seed: int, step: int, purpose: str, device: str | torch.device = "cpu") -> torch.Generator:
     """A generator whose stream depends on the three keys alone."""
     return torch.Generator(device=device).manual_seed(_key(seed, step, purpose))
+
+
+def random_numbers(below: int, count: int, generators: Sequence[torch.Generator]) -> Int[Tensor, "N"]:
+    """``count`` random numbers from 0 to ``below`` of each generator."""
+    return torch.cat([torch.randint(below, (count,), generator=g, device=g.device) for g in generators])
 
 
 def _key(seed: int, step: int, purpose: str) -> int:

@@ -18,6 +18,7 @@ from training_runs import datamanager, in_capture_frame
 
 from mmpi_ns.data import rays
 from mmpi_ns.data.rays import CameraRays, image_rays
+from mmpi_ns.utils.random_draws import generator
 from mmpi_priors.sfm import MIN_TRACK
 
 TRACKED = sum(project(i, wall_points())[1].astype(int) for i in range(8)) >= MIN_TRACK
@@ -55,6 +56,8 @@ def test_rays_drawn_together_are_those_of_each_step_whatever_comes_between(scene
     other = datamanager(scene)
     for step in (13, 3, 4, 19):
         assert same(steps[step], other.next_train(step))
+        alone, batch = other.sources.draw(64, generator(other.config.seed, step, "pixels"))  # as on a GPU
+        assert same(steps[step], (alone[0], {"indices": batch["indices"][0]}))
     other.use_cameras(np.array([2]))
     assert set(other.next_train(18)[1]["indices"][:, 0].tolist()) == {2}
 

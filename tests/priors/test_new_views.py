@@ -72,7 +72,7 @@ def find(known=None, dataset=None):
 
 
 def drawn(points):
-    bundle, colors, depths = points.draw(2000, rays_of, torch.Generator().manual_seed(0))
+    bundle, colors, depths = points.draw(2000, rays_of, [torch.Generator().manual_seed(0)])
     return bundle.origins.double().numpy(), bundle.directions.double().numpy(), colors.numpy(), depths.double().numpy()
 
 
