@@ -241,7 +241,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if not self.training:
             g = generator(self.config.seed, self.train_count, "pixels", self.device)
             rays, batch = sources.draw(pixel_rays, g, pixels_alone=True)
-        elif torch.device(self.device).type == "cpu":
+        elif torch.device(self.device).type == "cpu" and not self.draws.recording:
             number, place = divmod(step, AT_ONCE)
             if self._drawn is None or self._drawn[0] is not sources or self._drawn[1] != (number, pixel_rays):
                 steps = range(number * AT_ONCE, (number + 1) * AT_ONCE)
