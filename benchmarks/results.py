@@ -116,7 +116,7 @@ class Results(Bench):
         renders = ["--render-output-path", str(folder / "renders")]
         scene = Scene(self.data / variant.capture, variant.factor)
         _, results, made = train_and_evaluate(scene, folder, variant.method, options, renders, self.cores)
-        row = {k: results[k] for k in ("psnr", "ssim", "field_psnr", "field_ssim", "num_rays_per_sec") if k in results}
+        row = {k: results[k] for k in ("psnr", "ssim", "field_psnr", "field_ssim") if k in results}
         row |= {"key": variant.key, "capture": f"{variant.capture} /{variant.factor}"}
         row |= {"name": f"`{variant.method}`" + (f", {variant.name}" if variant.name != "defaults" else "")}
         print(f"{variant.key}, seed {seed}: {row['psnr']:.2f} dB, {row['ssim']:.3f}", flush=True)
@@ -184,14 +184,13 @@ def results_page(made: dict[str, Row]) -> str:
         "field alone": lambda r: f"{r['field_psnr']:.2f} / {r['field_ssim']:.3f}" if r["field_psnr"] else "the same",
         "processor s": "{processor_seconds:.0f}",
         "GiB": "{gib:.1f}",
-        "rendering, rays/s": "{num_rays_per_sec:.0f}",
     }
     blocks = []
     for name, content in made.items():
         done, stamp = finished(content), stamp_line(content["made"])
         blocks += [f"**{TABLES[name]}**", *([stamp] if stamp not in blocks else []), table(columns, means(content))]
-        of_table = (v for v in VARIANTS if v.table == name)
-        if missing := [v.key for v in of_table if not all(f"{v.key}, seed {seed}" in done for seed in v.seeds)]:
+        asked = [f"{v.key}, seed {seed}" for v in VARIANTS if v.table == name for seed in v.seeds]
+        if missing := [key for key in asked if key not in done]:
             blocks += [f"Not run: {'; '.join(missing)}."]
     blocks += ["![PSNR and SSIM over seconds](results.png)"]
     return "\n\n".join(blocks)
