@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import platform
 import subprocess
 from pathlib import Path
 
@@ -21,9 +22,9 @@ FORBIDDEN = {4: ["-mno-avx"], 8: ["-mno-avx512f"], 16: []}
 @pytest.mark.parametrize("width", FORBIDDEN)
 def test_registers_of_every_width_give_the_same(width, tmp_path):
     target = tmp_path / "lanes.so"
-    made = subprocess.run([*build.compiler(), *build.FLAGS, *FORBIDDEN[width], str(SOURCE), "-o", str(target)])
-    if made.returncode:
-        pytest.skip("this compiler or processor has other registers")
+    if FORBIDDEN[width] and platform.machine() != "x86_64":
+        pytest.skip("other processors have registers of one width")
+    subprocess.run([*build.compiler(), *build.FLAGS, *FORBIDDEN[width], str(SOURCE), "-o", str(target)], check=True)
     lanes = ctypes.CDLL(str(target))
     if lanes.width_of_registers() != width:
         pytest.skip(f"this processor has registers of {lanes.width_of_registers()} numbers at most")
