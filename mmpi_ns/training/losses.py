@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -62,7 +63,7 @@ def point_color(
 def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]:
     """Entropy of the transmittance behind the last sample: a ray should be either opaque or empty (L_bg)."""
     p = transmittance.clamp(1e-6, 1 - 1e-6)
-    return (torch.special.entr(p) + torch.special.entr(1 - p)).mean()
+    return torch.special.entr(torch.cat([p, 1 - p], -1)).sum(-1).mean()
 
 
 def depth_priors(
@@ -80,7 +81,7 @@ def depth_priors(
         outliers: likelihood of an outlier.
         count: rays that the mean is over.
     """
-    return torch.where(reached, -torch.log(mass + outliers), torch.zeros_like(mass)).sum() / count
+    return (mass + outliers).masked_fill(~reached, 1).log().sum() / -count
 
 
 def batch_losses(
@@ -106,39 +107,39 @@ def batch_losses(
     bundle = rays.bundle
     assert isinstance(bundle, TrainingRays)
     # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
-    asked, size, device = len(image), len(rays.bundle) // rays.times, image.device
-    every = torch.arange(rays.times * size, device=device).view(rays.times, size)
-    pixels, keypoints = every[:, :asked].reshape(-1), every[:, asked:].reshape(-1)
-    image = image.repeat(rays.times, 1)
+    asked, size = len(image), len(bundle) // rays.times
+    batch = lambda values: values.view(rays.times, size, *values.shape[1:])  # noqa: E731
+    of_pixels, of_keypoints = (lambda x, s=s: batch(x)[:, s].flatten(0, 1) for s in (slice(asked), slice(asked, size)))
+    image = image.expand(rays.times, *image.shape).flatten(0, 1)
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)
     # If MPIs train separately and cover a ray only in part, the remaining transmittance is not penalised.
-    background = torch.where(rays.samples.fully_covered[pixels], random, observed)
+    background = torch.where(of_pixels(rays.samples.fully_covered), random, observed)
     per_ray = (rays.rgb, rays.sums.mass, rays.sums.first, rays.sums.second, rays.composite.transmittance)
-    colors, mass, first, second, transmittance = (x.index_select(0, pixels) for x in per_ray)
+    colors, mass, first, second, transmittance = map(of_pixels, per_ray)
     rgb = colors + transmittance * background
     sums = _depth_sums(rays, bundle, field)
-    exposure = None if bundle.exposures is None else bundle.exposures.index_select(0, pixels)
+    exposure = None if bundle.exposures is None else of_pixels(bundle.exposures)
     total = {
         "rgb_loss": photometric(rgb, observed, exposure),
         "point_color": weight.point_color * point_color(mass, first, second, observed),
         "entropy": weight.background_entropy * background_entropy(transmittance),
-        "distortion": weight.distortion * sums.spread.index_select(0, pixels).mean(),
+        "distortion": weight.distortion * of_pixels(sums.spread).mean(),
     }
-    if len(keypoints):
-        reached = sums.reached[keypoints]
+    if asked < size:
+        reached = of_keypoints(sums.reached)
         total["keypoint_depth"] = weight.keypoint_depth * depth_priors(
-            sums.mass.index_select(0, keypoints), reached, KEYPOINT_OUTLIERS, reached.sum().clamp(min=1)
+            of_keypoints(sums.mass), reached, KEYPOINT_OUTLIERS, reached.sum().clamp(min=1)
         )
     if bundle.disparities is not None and weight.depth_priors > 0:
         total["depth_priors"] = (weight.depth_priors * decay) * depth_priors(
-            sums.mass.index_select(0, pixels), sums.reached[pixels], DEPTH_OUTLIERS, max(1, len(pixels))
+            of_pixels(sums.mass), of_pixels(sums.reached), DEPTH_OUTLIERS, max(1, len(image))
         )
     if rays.lookup is not None and step % TV_EVERY == 0 and field.density.requires_grad:
         variation = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features, weight.tv_chroma)
         total["tv"] = TV_EVERY / max(1, len(image)) * variation
     errors = ((rgb - observed).detach() ** 2).sum(-1)
-    return total, errors.new_zeros(len(rays.bundle)).index_copy(0, pixels, errors)
+    return total, pad(errors.view(rays.times, asked), (0, size - asked)).flatten()
 
 
 def _depth_sums(rays: RenderedRays, bundle: TrainingRays, field: MMPIField) -> DepthSums:
@@ -147,12 +148,12 @@ def _depth_sums(rays: RenderedRays, bundle: TrainingRays, field: MMPIField) -> D
     targets = bundle.origins.new_zeros(len(bundle), 2) if targets is None else targets
     # The spacing of planes in inverse distance: a surface between two is represented by both. Those of the densest MPI
     # count: one with few planes may stand at a camera, where they suffice.
-    least = PLANE_ERROR * min((m.disparity_step for m in field.plan.mpis), default=0.0)
-    targets = torch.stack([targets[:, 0], (targets[:, 1] ** 2 + least**2).sqrt().clamp(min=1e-12)], -1)
+    least = max(1e-12, PLANE_ERROR * min((m.disparity_step for m in field.plan.mpis), default=0.0))
+    targets = torch.stack([targets[:, 0], (targets[:, 1] ** 2 + least**2).sqrt()], -1)
     if (keypoints := bundle.keypoint_disparities) is not None:
         windows = torch.cat([keypoints, KEYPOINT_WIDTH * keypoints], -1)
         targets = torch.where(keypoints > 0, windows, targets)
-    weights, intervals = rays.composite.weights, 1 / samples.num_intersected.clamp(min=1).to(rays.rgb)
+    weights, intervals = rays.composite.weights, samples.num_intersected.clamp(min=1).to(rays.rgb).reciprocal()
     return depth_sums(weights, samples.inverse_t, samples.starts, intervals, targets, field.plan.content_near)
 
 
