@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int, Int16, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
 from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.priors import DepthPriors, SharedPoints, unpacked
@@ -89,20 +90,24 @@ class PixelPool:
         """Number of pixels in the pool; read from the device once, not in every step."""
         return int((self.ends - self.begins).sum())
 
+    @cached_property
+    def _of_images(self) -> tuple[Int[Tensor, "I"], Int[Tensor, "I 4"]]:
+        """Of each image: pixels up to its last; what to add to their index, its first pixel, width and number."""
+        after = (self.ends - self.begins).cumsum(0)
+        return after, torch.stack([self.ends - after, self.begins, self.widths, self.images], -1)
+
     def draw(
         self, count: int, *generators: torch.Generator
     ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
         """Colours, (image, row, column) and depths of ``count`` random pixels of each generator."""
-        after = (self.ends - self.begins).cumsum(0)
+        after, of_images = self._of_images
         drawn = random_numbers(self.count, count, generators).to(self.colors.device)
-        which = torch.searchsorted(after, drawn, right=True)
-        chosen = drawn - after[which] + self.ends[which]
-        place = chosen - self.begins[which] if self.places is None else self.places[chosen].long()
-        width = self.widths[which]
-        indices = torch.stack([self.images[which], place // width, place % width], -1)
-        nothing = torch.zeros(len(drawn), 2, device=self.colors.device)
-        depths = nothing if self.depths is None else unpacked(self.depths[chosen])
-        return self.colors[chosen].float() / 255, indices, depths
+        offset, begin, width, image = of_images[torch.searchsorted(after, drawn, right=True)].unbind(-1)
+        chosen = drawn + offset
+        place = chosen - begin if self.places is None else self.places[chosen].long()
+        indices = torch.stack([image, place // width, place % width], -1)
+        depths = drawn.new_zeros(len(drawn), 2).float() if self.depths is None else unpacked(self.depths[chosen])
+        return self.colors[chosen] / 255, indices, depths
 
 
 def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
@@ -196,17 +201,17 @@ class RaySources:
         if self.exposures is not None:
             colors[:, :3] /= self.exposures[indices[:, 0]]
         bundles, images, device = [self.rays(indices)], [colors], colors.device
-        priors = [torch.cat([torch.zeros_like(depths[:, :1]), depths], -1)]  # of keypoints, and of other surfaces
+        priors = [pad(depths, (1, 0))]  # of keypoints, and of other surfaces
         _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays)
         if self.new_views is not None and new_view_rays:
             views, seen, depths = self.new_views.draw(new_view_rays, self.rays, generators, self.exposures)
             bundles.append(views)
             images.append(seen)
-            priors.append(torch.cat([torch.zeros_like(depths[:, :1]), depths], -1))
+            priors.append(pad(depths, (1, 0)))
         if self.keypoints is not None and keypoint_rays:
             drawn = self.keypoints[random_numbers(len(self.keypoints), keypoint_rays, generators).to(device)]
             bundles.append(drawn)
-            priors.append(torch.nn.functional.pad(cast(Tensor, drawn.keypoint_disparities), (0, 2)))
+            priors.append(pad(cast(Tensor, drawn.keypoint_disparities), (0, 2)))
 
         def joined(parts: list[Tensor]) -> Tensor:
             return torch.cat([part.view(steps, -1, part.shape[-1]) for part in parts], 1)
@@ -216,9 +221,9 @@ class RaySources:
         keypoints, depths = joined(priors).split([1, 2], -1)
         rays = TrainingRays(
             **columns,
-            keypoint_disparities=keypoints.contiguous(),
-            disparities=depths.contiguous(),
+            keypoint_disparities=keypoints,
+            disparities=depths,
             exposures=None if self.exposures is None else self.exposures[columns["camera_indices"][..., 0]],
             through_pixel=(torch.arange(keypoints.shape[1], device=device) < pixel_rays)[:, None].expand(steps, -1, 1),
         )
-        return rays, {"image": joined(images), "indices": joined([indices])}
+        return rays, {"image": joined(images), "indices": indices.view(steps, -1, 3)}

@@ -92,15 +92,15 @@ class CameraRays:
         """Rays through pixel centres (camera, row, column). Pixel areas are those at distance 1; of a lens, those at
         its centre."""
         camera, row, column = ray_indices.unbind(-1)
-        poses = self.poses[camera]
+        poses, focal = self.poses[camera], self.focal[camera]
         if self.lenses is None:
-            u, v = ((ray_indices[:, 1:].flip(-1) + 0.5 - self.principal[camera]) / self.focal[camera]).unbind(-1)
-            local = torch.stack([u, -v, -torch.ones_like(u)], -1)
+            u, v = ((ray_indices[:, 1:].flip(-1) + 0.5 - self.principal[camera]) / focal).unbind(-1)
+            local = torch.stack([u, -v, torch.full_like(u, -1)], -1)
         else:
             directions, first, widths = self.lenses
             local = directions[first[camera] + row * widths[camera] + column]
         directions = torch.nn.functional.normalize(rotate(poses[:, :, :3], local), dim=-1)
-        area = 1 / (self.focal[camera].prod(-1, keepdim=True) * local.square().sum(-1, keepdim=True))
+        area = (focal.prod(-1, keepdim=True) * local.square().sum(-1, keepdim=True)).reciprocal()
         return RayBundle(poses[:, :, 3], directions, pixel_area=area, camera_indices=camera[:, None], metadata={})
 
 
