@@ -27,8 +27,7 @@ MOST = 200.0
 
 def ray_numbers(starts: Int[Tensor, "R+1"], count: int) -> Int[Tensor, "N"]:
     """Ray of each of ``count`` samples; R behind the last ray."""
-    counts = torch.cat([starts, starts.new_full((1,), count)]).diff()
-    return torch.repeat_interleave(counts, output_size=count)
+    return torch.repeat_interleave(pad(starts, (0, 1), value=count).diff(), output_size=count)
 
 
 def sum_by_ray(
@@ -38,13 +37,14 @@ def sum_by_ray(
     return values.new_zeros(len(starts), *values.shape[1:]).index_add(0, numbers, values)[:-1]
 
 
-def sum_before(values: Float[Tensor, "N"], starts: Int[Tensor, "R+1"], numbers: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """Sum of all earlier samples on the ray, in float64, with gradients.
+def sum_before(values: Float[Tensor, "N *C"], starts: Int[Tensor, "R+1"], numbers: Int[Tensor, "N"]) -> Tensor:
+    """Sum of all earlier samples on the ray [N, *C], in float64, with gradients.
 
     It is a difference of sums over all rays. So that no ray spoils the others, numbers beyond ``MOST`` count as that,
     and what is no number as 0.
     """
-    total = pad(values.double().nan_to_num(0.0, MOST).clamp(max=MOST).cumsum(0), (1, 0))
+    total = values.double().nan_to_num(0.0, MOST).clamp(max=MOST).cumsum(0)
+    total = pad(total, (0, 0) * (values.ndim - 1) + (1, 0))
     return total[:-1] - total[starts][numbers]
 
 
@@ -83,12 +83,12 @@ def composite_weights(
     Source: paper eq. (rendering) and its blended form in sec. III-C.
     """
     numbers = ray_numbers(starts, len(tau))
-    tau = torch.where(numbers < len(starts) - 1, tau, 0.0)
+    tau = tau.masked_fill(numbers == len(starts) - 1, 0.0)
     before = sum_before(tau, starts, numbers).to(tau.dtype)
     weights = -(torch.exp(-before - skipped_before) * torch.expm1(-tau))
-    mass, depth = (sum_by_ray(x.double()[:, None], starts, numbers).to(tau.dtype) for x in (weights, tau))
-    depth = depth + skipped_total
-    return Composite(weights, mass, -torch.expm1(-depth), torch.exp(-depth))
+    mass, depth = sum_by_ray(torch.stack([weights, tau], -1).double(), starts, numbers).to(tau.dtype).split(1, -1)
+    log = -(depth + skipped_total)
+    return Composite(weights, mass, -torch.expm1(log), torch.exp(log))
 
 
 class _CompositeWeights(torch.autograd.Function):
@@ -111,7 +111,8 @@ class _CompositeWeights(torch.autograd.Function):
 def composite_weights_on_cpu(tau: Tensor, starts: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
     tensors = (*dense(tau), starts.contiguous(), *dense(skipped_before, skipped_total))
     weights, mass, depth = _CompositeWeights.apply(*tensors)  # type: ignore[misc]
-    return Composite(weights, mass, -torch.expm1(-depth), torch.exp(-depth))
+    log = -depth
+    return Composite(weights, mass, -torch.expm1(log), torch.exp(log))
 
 
 def render_colors(

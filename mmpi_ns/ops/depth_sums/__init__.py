@@ -52,19 +52,19 @@ def depth_sums(
     numbers = ray_numbers(starts, len(weights))
     of_rays = numbers.clamp(max=max(0, len(intervals) - 1))
     with torch.no_grad():
-        positions = 1 / (1 + scale * inverse_t)
-        each = [x.double() for x in (weights, weights * positions)]
-        (before, total), (moment, moments) = (
-            (sum_before(x, starts, numbers), sum_by_ray(x, starts, numbers)[of_rays]) for x in each
-        )
-        pairs = (2 * (before + weights) - total) * positions + moments - 2 * (moment + weights * positions)
+        positions = (1 + scale * inverse_t).reciprocal()
+        weighted = weights * positions
+        each = torch.stack([weights, weighted], -1).double()
+        before, moment = sum_before(each, starts, numbers).unbind(-1)
+        total, moments = sum_by_ray(each, starts, numbers)[of_rays].unbind(-1)
+        pairs = (2 * (before + weights) - total) * positions + moments - 2 * (moment + weighted)
         slope = (2 * pairs + 2 / 3 * weights * intervals[of_rays]).to(weights.dtype)
         away = ((inverse_t - targets[of_rays, 0]) / targets[of_rays, 1]) ** 2
         within = sum_by_ray((away < REACH**2).long(), starts, numbers)
         # Bounded from below, since exponentials that underflow take far longer.
         window = torch.exp(-0.5 * away.clamp(max=120))
     # A quadratic form of the weights is half of their product with its gradient.
-    twice, mass = (sum_by_ray(weights * x, starts, numbers) for x in (slope, window))
+    twice, mass = sum_by_ray(weights[:, None] * torch.stack([slope, window], -1), starts, numbers).unbind(-1)
     return DepthSums(twice - 0.5 * twice.detach(), mass, (within > 0) & (targets[:, 0] > 0))
 
 

@@ -102,8 +102,7 @@ def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False, mo
     listed, order = rows.reshape(-1).sort()
     place = torch.diff(listed, prepend=listed[:1]).ne(0).cumsum(0)
     if most is not None:
-        unique = torch.zeros(most + 1, dtype=listed.dtype, device=listed.device)
-        unique = unique.index_copy(0, place.clamp(max=most), listed)[:most]
+        unique = listed.new_zeros(most + 1).index_copy(0, place.clamp(max=most), listed)[:most]
         positions = torch.empty_like(place).index_copy(0, order, place.clamp(max=most - 1))
         return RowIndex(unique, positions.view(rows.shape), place[-1] + 1)
     count = len(listed) if pads or not len(listed) else int(place[-1]) + 1

@@ -252,10 +252,10 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     count = sum(of_heads) if capacity is None else capacity.samples
     starts = pad(m.kept.cumsum(0), (1, 0)).clamp(max=count)
     owner, room = ray_numbers(starts, count), m.samples[0].shape[1]
-    filled = owner < len(m.kept)
-    slots = torch.where(filled, owner * room + torch.arange(count, device=starts.device) - starts[owner], 0)
+    behind, slots = owner == len(m.kept), owner * room + torch.arange(count, device=starts.device) - starts[owner]
+    slots = slots.clamp(max=len(m.kept) * room - 1)
     flat = (x.flatten(0, 1)[slots] for x in m.samples)
-    heads, planes, *others = (torch.where(filled.view(-1, *[1] * (x.ndim - 1)), x, 0) for x in flat)
+    heads, planes, *others = (x.masked_fill_(behind.view(-1, *[1] * (x.ndim - 1)), 0) for x in flat)
     numbers = torch.cat([m.numbers.sum(0, keepdim=True), m.numbers])
     of_rays = (m.skipped_total, m.dropped_mass, m.num_intersected, m.fully_covered, of_heads)
     return MergedSamples(heads.long(), planes.long(), *others, starts, *of_rays, capacity, numbers)
