@@ -296,8 +296,7 @@ class MMPIField(TexelTables):
             (self.features, lookup.features, feature_weight, chroma_times),
         ):
             if weight > 0:
-                term = total_variation(values, table.data, lookup.rows, self.layout, scales, chroma)
-                total = total + weight * term
+                total = total + weight * total_variation(values, table.data, lookup.rows, self.layout, scales, chroma)
         return total
 
     def sample_shares(self, rays: RayBundle, samples: MergedSamples) -> tuple[Tensor, Tensor]:

@@ -118,6 +118,7 @@ class StepGraphs:
     def _drop(self) -> None:
         """Frees the recordings and their memory."""
         self._recorded: dict[Any, Recorded] = {}
+        self._rooms: dict[Capacity, Tensor] = {}  # which recordings read
         self._recorder = None  # torch does not share memory of freed graphs
 
     # A step ------------------------------------------------------------------------------------------------------
@@ -190,10 +191,7 @@ class StepGraphs:
         if capacity is not None:
             numbers, distinct = rays.samples.numbers, rays.lookup.distinct
             results.used = torch.cat([numbers, distinct[None].to(numbers.dtype)])
-            fits = distinct <= capacity.rows
-            for number, most in zip(numbers.unbind(), (capacity.samples, *capacity.heads), strict=True):
-                fits = fits & (number <= most)
-            (total * fits).backward()
+            (total * (results.used <= self._room).all()).backward()
         else:
             total.backward()
             self._measure(rays)
@@ -271,6 +269,8 @@ class StepGraphs:
         """Records a kind of step and runs its first half; None if the replay differs."""
         capacity, fields = self.capacity, self.model.field
         assert capacity is not None
+        room = torch.tensor([capacity.samples, *capacity.heads, capacity.rows], device=fields.density.device)
+        self._room = self._rooms.setdefault(capacity, room)
         of_kind = (*kind, *self._state[6:])
         expected = None
         if of_kind not in self._compared:

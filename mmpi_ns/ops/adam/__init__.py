@@ -60,12 +60,11 @@ def adam(
 ) -> tuple[Tensor, Tensor]:
     """New values and moments."""
     beta1, beta2, correction, eps, rate = constants
-    touched, (mean, square) = grad != 0, moments.to(param.dtype).unbind(1)
-    mean = torch.where(touched, mean.lerp(grad, 1 - beta1), mean)
-    square = torch.where(touched, (square * beta2).addcmul_(grad, grad, value=1 - beta2), square)
+    untouched, (mean, square) = grad == 0, moments.to(param.dtype).unbind(1)
+    mean, square = mean.lerp(grad, 1 - beta1), (square * beta2).addcmul_(grad, grad, value=1 - beta2)
     delta = mean / square.sqrt().div_(correction).add_(eps)
-    delta = torch.where(touched, delta, torch.zeros_like(delta))
-    return param - delta.mul_(rate), torch.stack([mean, square], 1).to(moments.dtype)
+    new = torch.stack([mean, square], 1).to(moments.dtype)
+    return param - delta.masked_fill_(untouched, 0).mul_(rate), torch.where(untouched[:, None], moments, new)
 
 
 @adam_rows.on_cpu

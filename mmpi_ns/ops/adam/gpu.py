@@ -43,8 +43,7 @@ def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, consta
     if not (param.is_contiguous() and moments.is_contiguous()):
         definition.adam_rows.reference(param, moments, rows, grad, constants)
         return
-    channels, device, (beta1, beta2, *numbers) = param.shape[1], param.device, constants
-    correction, eps, rate = numbers
+    channels, device, (beta1, beta2, correction, eps, rate) = param.shape[1], param.device, constants
     correction, rate = (torch.as_tensor(x, dtype=torch.float32, device=device) for x in (correction, rate))
     columns = triton.next_power_of_2(channels)
     block = block_size(max(32, NUMBERS // columns), device)
