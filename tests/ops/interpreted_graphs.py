@@ -3,12 +3,14 @@ does, on a CPU: the operations of a function are recorded, and repeated on the s
 
 from __future__ import annotations
 
+import functools
+
 import pytest
 import torch
 from compiled import interpreted  # noqa: F401
 from nerfstudio.engine.callbacks import TrainingCallbackLocation as At
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_map_only
+from torch.utils._pytree import tree_leaves, tree_map_only
 from training_runs import ready, trainer_config
 
 from mmpi_ns.data.rays import CameraRays
@@ -46,6 +48,13 @@ class Tape(TorchDispatchMode):
             self.done.append((func, *tree_map_only(torch.Tensor, lambda x: x.detach(), (args, kwargs, made))))
         return made
 
+    @property
+    def launches(self) -> list:
+        """Names of the operations and kernels that a GPU is given, with the sizes of their tensors."""
+        sizes = lambda *args: [tuple(x.shape) for x in tree_leaves(args) if isinstance(x, torch.Tensor)]  # noqa: E731
+        named = [(func.__name__, sizes(args, kwargs)) for func, args, kwargs, _ in self.done]
+        return [(name, each) for name, each in named if not ("empty" in name or name.startswith("_record_function"))]
+
     @torch.no_grad()
     def replay(self) -> None:
         for func, args, kwargs, made in self.done:
@@ -75,7 +84,8 @@ class TapeRecorder:
         tape, launch = Tape(), GridExecutor.__call__
 
         def noted(executor, *args, **kwargs):
-            tape.done.append((lambda *_: launch(executor, *args, **kwargs), (), {}, None))
+            again = functools.wraps(executor.fn)(lambda *_: launch(executor, *args, **kwargs))
+            tape.done.append((again, args, {}, None))
             tape.paused = True
             try:
                 return launch(executor, *args, **kwargs)
@@ -97,6 +107,8 @@ class TapeRecorder:
 
 
 STEPS = 16
+MOST = {"joint": 570, "individual": 710, "blend": 1100, "finetune": 1210}
+"""Launches of a step in each phase, of two MPIs and a cube."""
 
 
 def prepared(scene, plan_file, folder, training="joint", shading="ray", recorder=None):
@@ -145,6 +157,22 @@ def test_recorded_steps_train_what_steps_one_operation_at_a_time_do(scene, plan_
     assert not graphs.is_off and not graphs.lost and by_operations.repeated == 0
     assert graphs.repeated >= STEPS - 5 * MEASURED
     assert not any(tape.waits for tape in recorder.tapes)
+
+
+@pytest.mark.parametrize(("training", "shading"), [("joint", "ray"), ("two-phase", "sample")])
+def test_a_step_has_few_launches_and_another_of_its_kind_the_same(scene, plan_file, tmp_path, training, shading):
+    run, graphs, recorder = prepared(scene, plan_file, tmp_path, training, shading)
+    first, most = {}, dict.fromkeys(MOST, 0)
+    for step in range(STEPS):
+        graphs._drop()  # so that this step is recorded
+        known = len(recorder.tapes)
+        run(step)
+        if launches := [each for tape in recorder.tapes[known:] for each in tape.launches]:
+            phase = graphs.model.progress.schedule.phase_at(step).name
+            most[phase] = max(most[phase], len(launches))
+            assert launches == first.setdefault((phase, graphs._kind(step), graphs.capacity), launches)
+    assert all(most[phase] <= MOST[phase] for phase in MOST), most
+    assert any(most.values()) and not any(tape.waits for tape in recorder.tapes)
 
 
 def test_a_step_that_does_not_fit_changes_nothing_and_the_next_one_has_room(scene, plan_file, tmp_path):
