@@ -5,6 +5,8 @@ Weights and normalisations: docs/how_it_works.md. Total variation is computed on
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -108,8 +110,11 @@ def batch_losses(
     assert isinstance(bundle, TrainingRays)
     # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
     asked, size = len(image), len(bundle) // rays.times
-    batch = lambda values: values.view(rays.times, size, *values.shape[1:])  # noqa: E731
-    of_pixels, of_keypoints = (lambda x, s=s: batch(x)[:, s].flatten(0, 1) for s in (slice(asked), slice(asked, size)))
+
+    def chosen(values: Tensor, first: int, end: int) -> Tensor:
+        return values.view(rays.times, size, *values.shape[1:])[:, first:end].flatten(0, 1)
+
+    of_pixels, of_keypoints = partial(chosen, first=0, end=asked), partial(chosen, first=asked, end=size)
     image = image.expand(rays.times, *image.shape).flatten(0, 1)
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)

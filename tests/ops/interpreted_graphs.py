@@ -51,9 +51,12 @@ class Tape(TorchDispatchMode):
     @property
     def launches(self) -> list:
         """Names of the operations and kernels that a GPU is given, with the sizes of their tensors."""
-        sizes = lambda *args: [tuple(x.shape) for x in tree_leaves(args) if isinstance(x, torch.Tensor)]  # noqa: E731
-        named = [(func.__name__, sizes(args, kwargs)) for func, args, kwargs, _ in self.done]
-        return [(name, each) for name, each in named if not ("empty" in name or name.startswith("_record_function"))]
+        listed = []
+        for func, args, kwargs, _ in self.done:
+            if not ("empty" in func.__name__ or func.__name__.startswith("_record_function")):
+                tensors = (x for x in tree_leaves((args, kwargs)) if isinstance(x, torch.Tensor))
+                listed.append((func.__name__, [tuple(x.shape) for x in tensors]))
+        return listed
 
     @torch.no_grad()
     def replay(self) -> None:
