@@ -1,12 +1,13 @@
 """Adaptive blending by reliability: the share of a sample among the heads that cover its position (paper sec. III-C).
 
-Three steps: every head's reliability R at the sample (``log_shares``), shares P by a softmax over the heads that cover
-it (``blend_shares``), and the sample's optical depth once its alpha is multiplied by its share
-(``blended_optical_depth``). Plain torch, with gradients. The compiled marches contain their own form without gradients.
+Three steps: the heads that cover the sample, and their reliabilities R there (``find_votes``), shares P by a softmax
+over them (``blend_shares``), and the sample's optical depth once its alpha is multiplied by its share
+(``blended_optical_depth``). With gradients; the compiled marches contain their own form without.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -14,10 +15,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.heads import CubeHead, MPIHead, heads_of
-from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.scene.geometry import LocalRays
+from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.ops.votes import Votes, find_votes_on_cpu
 
 
 def blend_shares(
@@ -76,42 +77,47 @@ def blended_optical_depth(
 
 def log_shares(
     layout: SceneLayout,
-    reliability: Float[Tensor, "T 1"],
-    touched: Tensor,
-    rays: Int[Tensor, "N"],
-    local: LocalRays,
+    tables: Tables,
+    origins: Float[Tensor, "N 3"],
+    directions: Float[Tensor, "N 3"],
     inverse_t: Float[Tensor, "N"],
     heads: Int[Tensor, "N"],
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-    """log P and log(1 - P) of samples among the heads that cover them, with gradients to the reliability.
+    """log P and log(1 - P) of samples among the heads that cover them, with gradients to the reliability. The arguments
+    are those of ``find_votes``."""
+    votes, shape = find_votes(layout, tables, origins, directions, inverse_t, heads), (len(heads), layout.num_heads)
+    values = interpolate(tables.reliability, votes.rows, votes.weights)[:, 0]
+    # One more, for what is no vote.
+    reliability = values.new_zeros(math.prod(shape) + 1).index_copy(0, votes.places, values)
+    covers = torch.zeros_like(reliability, dtype=torch.bool).index_fill(0, votes.places, True)
+    return blend_shares(reliability[:-1].view(shape), covers[:-1].view(shape), heads)
 
-    A head covers a point in its frustum if the nearest texel was trained (``touched`` [T]: 1 if a training ray read the
-    row); a sample's head always covers it.
+
+@operation("gpu", kernels="mmpi_ns.ops.votes")
+def find_votes(
+    layout: SceneLayout,
+    tables: Tables,
+    origins: Float[Tensor, "N 3"],
+    directions: Float[Tensor, "N 3"],
+    inverse_t: Float[Tensor, "N"],
+    heads: Int[Tensor, "N"],
+) -> Votes:
+    """Texels of the heads that cover samples.
+
+    A head covers a point in its frustum if the nearest texel was trained; a sample's head always covers it.
 
     Args:
-        reliability: R of all texels.
-        rays, inverse_t, heads: ray, inverse distance and head of each sample.
-        local: the rays in every head's axes.
+        layout: the scene.
+        tables: which texels were trained.
+        origins, directions, inverse_t, heads: ray, inverse distance and head of each sample.
     """
-    chosen, texels, cover = [], [], []
+    votes, first = [], torch.arange(len(heads), device=heads.device) * layout.num_heads
     for head in heads_of(layout):
-        ndc, inside = head.place_on_rays(local, rays, inverse_t)
-        is_own = heads == head.number
-        votes = inside | is_own
-        # Counting them would synchronise with a GPU: there all samples are looked up, the others in the empty brick.
-        on_gpu = heads.device.type != "cpu" or dispatch.interpreting
-        index = torch.arange(len(heads), device=heads.device) if on_gpu else votes.nonzero()[:, 0]
-        position, reads = ndc[index], votes[index]
-        rows, weights = head.grid.trilinear(position)
-        trained = head.covers(touched, position, reads)
-        chosen.append(index)
-        texels.append((rows * reads[:, None], weights))
-        cover.append(torch.zeros_like(is_own).index_copy(0, index, trained) | is_own)
-    # Read at once: gradients of the table are then one list of rows.
-    values = interpolate(reliability, *(torch.cat(parts) for parts in zip(*texels, strict=True)))[:, 0]
-    each = zip(values.split([len(i) for i in chosen]), chosen, strict=True)
-    columns = [value.new_zeros(len(heads)).index_copy(0, index, value) for value, index in each]
-    return blend_shares(torch.stack(columns, -1), torch.stack(cover, -1), heads)
+        ndc, inside = head.place_on_rays(origins, directions, inverse_t)
+        covers = head.covers(tables.touched, ndc, inside) | (heads == head.number)
+        places = torch.where(covers, first + head.number, len(heads) * layout.num_heads)
+        votes.append((places, *(x * covers[:, None] for x in head.grid.trilinear(ndc))))
+    return Votes(*(torch.stack(each, 1).flatten(0, 1) for each in zip(*votes, strict=True)))
 
 
 def head_shares(
@@ -121,8 +127,11 @@ def head_shares(
     touched: Tensor,
 ) -> Float[Tensor, "N H"]:
     """P of every head at points; 0 where a head does not cover one, and all 0 where none does. ``places`` are from
-    ``place_points``, the tables as in ``log_shares``."""
+    ``place_points``, ``touched`` [T] is 1 for rows that a training ray read."""
     covers = torch.stack([head.covers(touched, *place) for head, place in zip(heads, places, strict=True)], -1)
     values = [head.values(reliability, ndc)[:, 0] for head, (ndc, _) in zip(heads, places, strict=True)]
     values = torch.stack(values, -1).masked_fill(~covers, torch.finfo(reliability.dtype).min)
     return torch.where(covers, torch.softmax(values, -1), 0.0)
+
+
+find_votes.on_cpu(find_votes_on_cpu)

@@ -15,7 +15,7 @@ from torch import Tensor
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.ops.march import Rays
-from mmpi_ns.scene.geometry import Frames, LocalRays, PlaneHits, inverse_distance, local_to_ndc, sample_disparity
+from mmpi_ns.scene.geometry import Frames, PlaneHits, inverse_distance, local_rays, local_to_ndc, sample_disparity
 from mmpi_ns.scene.texels import TexelGrid
 
 Texels = tuple[Int[Tensor, "N T"], Float[Tensor, "N T"]]
@@ -66,30 +66,19 @@ class MPIHead(Head):
         """Its frame alone."""
         return Frames(*(x[self.number : self.number + 1] for x in vars(self.layout.frames).values()))
 
-    def place(
-        self, points: Float[Tensor, "N 3"], inverse_t: Float[Tensor, "N"]
+    def place_on_rays(
+        self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], inverse_t: Float[Tensor, "N"]
     ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
-        """NDC of points (u, v, s), each in [-1, 1] over the frustum, and whether they lie inside of it.
-
-        Args:
-            points: x / t in the head's axes, relative to its origin.
-            inverse_t: 1 / t; 0 at infinity, and 1 for points that are no samples of a ray.
-        """
-        ndc, inside = local_to_ndc(points[:, None], inverse_t[:, None], self.frame)
+        """NDC (u, v, s) of a point at an inverse distance along each ray, each in [-1, 1] over the frustum, and whether
+        the points lie inside of it."""
+        frame = self.frame
+        o, d = local_rays(origins, directions, frame)
+        ndc, inside = local_to_ndc(o * inverse_t[:, None, None] + d, inverse_t[:, None], frame)
         return ndc[:, 0], inside[:, 0]
 
-    def place_on_rays(
-        self, local: LocalRays, rays: Int[Tensor, "N"], inverse_t: Float[Tensor, "N"]
-    ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
-        """``place`` of points at inverse distances along rays."""
-        k = self.number
-        origins, directions = (x[:, k].index_select(0, rays) for x in (local.local_origins, local.local_directions))
-        return self.place(origins * inverse_t[:, None] + directions, inverse_t)
-
     def place_points(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
-        """``place`` of points in world axes."""
-        origins = LocalRays.of(points, torch.zeros_like(points), self.frame).local_origins[:, 0]
-        return self.place(origins, torch.ones_like(points[:, 0]))
+        """The same of points in world axes."""
+        return self.place_on_rays(points, torch.zeros_like(points), torch.ones_like(points[:, 0]))
 
     def sample(
         self, rays: Rays, hits: PlaneHits, numbers: Int[Tensor, "N"], index: Int[Tensor, "N"], first: Int[Tensor, "R"]
@@ -150,10 +139,9 @@ class CubeHead(Head):
         return ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1)
 
     def place_on_rays(
-        self, local: LocalRays, rays: Int[Tensor, "N"], inverse_t: Float[Tensor, "N"]
+        self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], inverse_t: Float[Tensor, "N"]
     ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
-        """``place_points`` of points at inverse distances along rays; at infinity nothing is inside."""
-        origins, directions = (x.index_select(0, rays) for x in (local.origins, local.directions))
+        """``place_points`` of a point at an inverse distance along each ray; at infinity nothing is inside."""
         ndc, inside = self.place_points(origins + directions / inverse_t.clamp(min=1e-10)[:, None])
         return ndc, inside & (inverse_t > 0)
 

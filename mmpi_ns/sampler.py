@@ -34,7 +34,7 @@ from mmpi_ns.ops.gather import Taps, gather_taps
 from mmpi_ns.ops.interpolate import texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MarchOptions, MergedSamples, RayOutputs, Rays, march_on_cpu, render_fused_on_cpu
-from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, plane_hits, sample_disparity
+from mmpi_ns.scene.geometry import PlaneHits, cube_hits, plane_hits, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.settings import SamplingConfig
 
@@ -90,7 +90,6 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     order, starts = merge(flat.rays, flat.inverse_t), pad(per_ray.cumsum(0), (1, 0))
     tau = flat.tau
     if options.blends and tau.numel():
-        local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
         tau = flat.tau.clone()
         # Front to back until the transmittance of a ray is below exp(-OPAQUE_DEPTH). Reliability costs a lookup in
         # every head, and most samples lie behind the first surface: those keep their unblended depth, which changes
@@ -104,8 +103,8 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
             depth = flat.tau[index]
             thick = (depth > NEGLIGIBLE).nonzero()[:, 0]
             sample = index[thick]
-            places = (flat.rays[sample], local, flat.inverse_t[sample], flat.heads[sample])
-            shares = log_shares(layout, tables.reliability, tables.touched, *places)
+            origins, directions = (x[flat.rays[sample]] for x in rays[:2])
+            shares = log_shares(layout, tables, origins, directions, flat.inverse_t[sample], flat.heads[sample])
             blended = blended_optical_depth(depth[thick], *shares)
             tau[index] = (depth / layout.num_heads).index_copy(0, thick, blended)
             passed.index_add_(0, flat.rays[index], tau[index])

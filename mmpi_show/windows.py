@@ -208,9 +208,7 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
             # Rays from the MPI's own origin, to keep precision far from the world's.
             directions = geometry.rotate(frames.axes[k].T, torch.stack([*tangents, torch.ones_like(x)], -1))
             disparity = (mpi.planes - 1 - plane) * mpi.disparity_step + 1 / mpi.far
-            local = geometry.LocalRays.of(frames.origins[k].expand_as(directions), directions, frames)
-            numbers = torch.arange(len(part), device=part.device)
-            samples = (numbers, local, disparity, torch.full_like(numbers, k))
-            log_share, _ = log_shares(field.layout, field.reliability, field.touched, *samples)
+            samples = (frames.origins[k].expand_as(directions), directions, disparity, torch.full_like(part, k))
+            log_share, _ = log_shares(field.layout, field.tables, *samples)
             shares[part, 0] = log_share.exp()
     return shares

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mmpi_ns.data.posed_images import PosedImages
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.scene.geometry import LocalRays, local_to_ndc, rotate
+from mmpi_ns.scene.geometry import local_rays, local_to_ndc, rotate
 from mmpi_ns.scene.plan import MPIPlan
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -31,8 +31,7 @@ def world_to_ndc(points, inverse_t, frames):
 
 def samples_to_ndc(origins, directions, inverse_t, frames):
     """``local_to_ndc`` of the points origins + t directions, from differences to each MPI's origin (exact far away)."""
-    local = LocalRays.of(origins, directions, frames)
-    local_origins, local_directions = local.local_origins, local.local_directions
+    local_origins, local_directions = local_rays(origins, directions, frames)
     return local_to_ndc(local_origins * inverse_t[:, None, None] + local_directions, inverse_t[:, None], frames)
 
 

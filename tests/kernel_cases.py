@@ -146,10 +146,23 @@ def _updates(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
+def _votes(device: str, shapes: Shapes) -> list[tuple]:
+    """Samples of each head inside and outside of it, some at infinity, behind the MPIs and along their planes."""
+    cases, ways = [], [(0.3, -0.2, 1.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.1, 0.0, -1.0)]
+    directions = torch.tensor(ways, device=device).repeat(2 * RAYS, 1)
+    for mpis in shapes.mpis:
+        layout, tables = _scene(device, shapes.cube, mpis)
+        heads, inverse_t = torch.arange(8 * RAYS, device=device) % layout.num_heads, _random(device, 8 * RAYS)
+        samples = (_random(device, 8 * RAYS, 3) * 0.4 - 0.2, directions, inverse_t * (inverse_t > 0.1))
+        cases += [(layout, tables, *(x[:count] for x in (*samples, heads))) for count in (0, len(heads))]
+    return cases
+
+
 CHANGED = {"adam_rows": (0, 1)}
 """Arguments that an operation changes."""
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "adam_rows": _updates,
+    "find_votes": _votes,
     "march": _marches,
     "total_variation": _variations,
     "gather_taps": _gathers,

@@ -25,7 +25,7 @@ from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MergedSamples
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.scene import geometry
-from mmpi_ns.scene.geometry import FACING_EPS, LocalRays, sample_disparity
+from mmpi_ns.scene.geometry import FACING_EPS, local_rays, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -302,9 +302,9 @@ class MMPIField(TexelTables):
     def sample_shares(self, rays: RayBundle, samples: MergedSamples) -> tuple[Tensor, Tensor]:
         """log P and log(1 - P) of the samples of rays, with gradients to the reliability."""
         # Shares have no gradients to poses.
-        local = geometry.LocalRays.of(rays.origins.detach(), rays.directions.detach(), self.layout.frames)
-        places = (samples.rays, local, samples.inverse_t, samples.heads)
-        return log_shares(self.layout, self.reliability, self.touched, *places)
+        origins, directions = (x.detach()[samples.rays] for x in (rays.origins, rays.directions))
+        tables = self.tables._replace(reliability=self.reliability)
+        return log_shares(self.layout, tables, origins, directions, samples.inverse_t, samples.heads)
 
 
 def moving(
@@ -327,8 +327,7 @@ def moving(
     """
     frames, in_cube, rays = layout.frames, samples.heads == len(layout.mpis), samples.rays
     mpis = torch.where(in_cube, 0, samples.heads)
-    local = LocalRays.of(origins, directions, frames)
-    o, d = local.local_origins, local.local_directions
+    o, d = local_rays(origins, directions, frames)
     facing = d[..., 2:] > FACING_EPS  # elsewhere there are no samples
     slope = d[..., :2] / torch.where(facing, d[..., 2:], 1)
     bend = o[..., :2] - o[..., 2:] * slope

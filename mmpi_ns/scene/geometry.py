@@ -74,20 +74,12 @@ def rotate(axes: Float[Tensor, "*#N 3 3"], vectors: Float[Tensor, "*#N 3"]) -> F
     return (axes * vectors[..., None, :]).sum(-1)
 
 
-@dataclass(frozen=True)
-class LocalRays:
-    """R rays in world axes, and in every MPI's axes relative to the MPI's origin."""
-
-    origins: Float[Tensor, "R 3"]
-    directions: Float[Tensor, "R 3"]
-    local_origins: Float[Tensor, "R K 3"]
-    local_directions: Float[Tensor, "R K 3"]
-
-    @staticmethod
-    def of(origins: Tensor, directions: Tensor, frames: Frames) -> LocalRays:
-        # Differences first, to keep precision far from the world origin.
-        local_origins = rotate(frames.axes, origins[:, None, :] - frames.origins)
-        return LocalRays(origins, directions, local_origins, rotate(frames.axes, directions[:, None, :]))
+def local_rays(
+    origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], frames: Frames
+) -> tuple[Float[Tensor, "R K 3"], Float[Tensor, "R K 3"]]:
+    """Origins and directions of rays in every MPI's axes, relative to the MPI's origin."""
+    # Differences first, to keep precision far from the world origin.
+    return rotate(frames.axes, origins[:, None, :] - frames.origins), rotate(frames.axes, directions[:, None, :])
 
 
 def plane_hits(
@@ -114,8 +106,7 @@ def plane_hits(
 
     Source: paper, sec. III-B ("sample and merge", forward-facing check); docs/how_it_works.md, "Intersected planes".
     """
-    local = LocalRays.of(origins, directions, frames)
-    o, d = local.local_origins, local.local_directions
+    o, d = local_rays(origins, directions, frames)
     dz, oz = d[..., 2], o[..., 2]
     facing = dz > FACING_EPS
     safe_dz = torch.where(facing, dz, torch.ones_like(dz))

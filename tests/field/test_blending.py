@@ -8,10 +8,16 @@ import numpy as np
 import oracle
 import pytest
 import torch
+from bricked import bricked_field, chance
+from compiled import both, compiled  # noqa: F401
 from hand_made import random_votes, tensor
+from marches import hard_rays
+from random_fields import random_rays
+from random_scenes import dense_grad
 
-from mmpi_ns.blending import blend_shares, blended_optical_depth
+from mmpi_ns.blending import blend_shares, blended_optical_depth, log_shares
 from mmpi_ns.ops.composite import composite_weights
+from mmpi_ns.ops.interpolate import Table
 
 F64 = torch.float64
 
@@ -90,6 +96,28 @@ def test_sole_cover_sends_all_gradient_to_its_depth_and_none_to_its_reliability(
     blended_optical_depth(tau, *shares).sum().backward()
     assert tau.grad.tolist() == [1.0, 1.0]
     assert reliability.grad.tolist() == [[0.0] * 3] * 2
+
+
+@pytest.mark.parametrize("count", [0, 1, 4000])
+def test_shares_of_samples_and_their_gradients_are_those_of_plain_torch(three_threads, count):
+    """Heads of several shapes, in which some texels are not stored and others not trained, and samples anywhere on
+    ordinary and hard rays: outside of their head, behind others, at infinity."""
+    field = bricked_field()
+    field.touched[chance(len(field.touched), 0.3)] = 0
+    rays = np.concatenate([random_rays(field.plan, 190, seed=1), (hard_rays().origins, hard_rays().directions)], 1)
+    origins, directions = tensor(np.tile(rays, (1, 20, 1))[:, :count], torch.float32)
+    inverse_t = tensor((np.random.default_rng(2).exponential(size=count) - 0.1).clip(0), torch.float32)
+    heads = torch.arange(count) % field.layout.num_heads
+
+    def shares():
+        table = Table(field.reliability.data)
+        tables = field.tables._replace(reliability=table)
+        log_share, log_rest = log_shares(field.layout, tables, origins, directions, inverse_t, heads)
+        (log_share + 2 * log_rest.clamp(min=-50)).sum().backward()
+        return log_share.detach(), log_rest.detach(), dense_grad(table)
+
+    for fast, plain in zip(*both(shares), strict=True):
+        torch.testing.assert_close(fast, plain, rtol=1e-5, atol=1e-4)
 
 
 # Blended optical depth -----------------------------------------------------------------------------------------------

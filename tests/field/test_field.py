@@ -12,7 +12,6 @@ from random_scenes import dense_grad, of_rays
 from mmpi_ns.blending import log_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import in_half_precision
-from mmpi_ns.scene.geometry import LocalRays
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 TABLES = ("density", "features", "reliability")
@@ -132,14 +131,12 @@ def test_a_head_votes_inside_its_frustum_where_it_was_trained_and_a_sample_count
     """Ray along z from the origin: 'front' holds it all, 'left' and the cube a part."""
     field = fill(MMPIField(plan), seed=4)
     rays = bundle([[0, 0, 0]], [[0, 0, 1]])
-    local = LocalRays.of(rays.origins, rays.directions, field.layout.frames)
     t = torch.tensor([1.5, 3.0, 6.0, 100.0])  # before the cube, in all three heads, behind it twice
-    rows, own = torch.zeros(4, dtype=torch.int64), torch.zeros(4, dtype=torch.int64)
     field.reliability.data.fill_(0.0)  # equal votes: P = 1 / number of heads that cover the point
 
     def shares(head):
-        tables = (field.layout, field.reliability, field.touched)
-        return (1 / log_shares(*tables, rows, local, 1 / t, torch.full_like(own, head))[0].exp()).round().tolist()
+        samples = (rays.origins.expand(4, 3), rays.directions.expand(4, 3), 1 / t, torch.full((4,), head))
+        return (1 / log_shares(field.layout, field.tables, *samples)[0].exp()).round().tolist()
 
     # 'left' stands at (2, 0, 3), looks along -x from 2 units on, and reaches |z - 3| <= depth.
     assert shares(0) == [2, 3, 1, 1]

@@ -1,4 +1,4 @@
-// Optical depth of a sample after blending by reliability (blending.log_shares, blend_shares, blended_optical_depth).
+// Optical depth of a sample after blending by reliability (blending.find_votes, blend_shares, blended_optical_depth).
 #pragma once
 #include "crossings.h"
 
@@ -12,12 +12,13 @@ inline void place_in_cube(const Cube& cube, const Packet& rays, int ray, float t
     }
 }
 
-// Position of a sample of a ray in head j; false outside its frustum.
-inline bool place(const Scene& scene, const Packet& rays, const Crossings& crossings, int ray, int64_t j,
-                  float inverse_t, float* ndc) {
+// Position of a sample of a ray, which is `local` in the MPIs' axes, in head j; false outside its frustum.
+template <typename Local>
+bool place(const Scene& scene, const Packet& rays, const std::vector<Local>& local, int ray, int64_t j, float inverse_t,
+           float* ndc) {
     if (j < scene.num_mpis) {
         const Mpi& mpi = scene.mpis[j];
-        const Lanes *o = crossings.mpis[j].origin, *d = crossings.mpis[j].direction;
+        const Lanes *o = local[j].origin, *d = local[j].direction;
         const float z = o[2][ray] * inverse_t + d[2][ray];
         if (!(z > 0)) {
             ndc[0] = ndc[1] = ndc[2] = 0;
@@ -47,7 +48,7 @@ inline float blended(const Scene& scene, const Packet& rays, const Crossings& cr
     float ndc[3], vote_of_head = 0, highest = -std::numeric_limits<float>::infinity(), others = 0;
     votes.clear();
     for (int64_t j = 0; j < scene.num_heads; j++) {
-        if (!place(scene, rays, crossings, ray, j, inverse_t, ndc) && j != own) continue;
+        if (!place(scene, rays, crossings.mpis, ray, j, inverse_t, ndc) && j != own) continue;
         const Grid& grid = scene.grids[j];
         if (j == own) {
             vote_of_head = trilinear(scene.reliability, grid, ndc);

@@ -44,15 +44,13 @@ inline Lanes floored(Lanes x) {
     return pick(whole > x, whole - 1.0f, whole);
 }
 
-// The intersected planes of one MPI: `count` of them from `first` on, counted from the last plane of the MPI.
-struct Crossing {
-    IntLanes first, count;
-    Lanes u, u_slope, v, v_slope; // tangents on the plane of disparity w: u + w u_slope
-    Lanes origin[3], direction[3]; // in the MPI's axes
+// Rays in an MPI's axes.
+struct LocalRays {
+    Lanes origin[3], direction[3];
 
-    Crossing() = default;
+    LocalRays() = default;
 
-    Crossing(const Mpi& mpi, const Packet& rays) {
+    LocalRays(const Mpi& mpi, const Packet& rays) {
         for (int a = 0; a < 3; a++) {
             const float* axis = mpi.axes[a];
             origin[a] = axis[0] * (rays.origin[0] - mpi.origin[0]) + axis[1] * (rays.origin[1] - mpi.origin[1]) +
@@ -60,6 +58,17 @@ struct Crossing {
             const int i = a < 2; // fixes which product is rounded, and so the bits of results
             direction[a] = axis[i] * rays.direction[i] + axis[1 - i] * rays.direction[1 - i] + axis[2] * rays.direction[2];
         }
+    }
+};
+
+// The intersected planes of one MPI: `count` of them from `first` on, counted from the last plane of the MPI.
+struct Crossing : LocalRays {
+    IntLanes first, count;
+    Lanes u, u_slope, v, v_slope; // tangents on the plane of disparity w: u + w u_slope
+
+    Crossing() = default;
+
+    Crossing(const Mpi& mpi, const Packet& rays) : LocalRays(mpi, rays) {
         const Lanes oz = origin[2], dz = direction[2];
         const Mask facing = dz > FACING;
         const Lanes depth = pick(facing, dz, splat(1)), inverse_far = 1.0f / rays.far;

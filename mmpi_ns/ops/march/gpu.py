@@ -24,7 +24,7 @@ from mmpi_ns.ops.gather.gpu import activate, sizes
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.ops.march import MarchOptions, MergedSamples, RayOutputs, Rays, empty_samples
-from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
+from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty, vectors
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
 HALF = tl.constexpr(ends.HALF)
@@ -76,13 +76,6 @@ def _ends(remaining, met, transmittance, depth, least_transmittance, STEPS: tl.c
     return tl.where(terminated, 0, remaining), tl.where(unseen >= 0, unseen, tl.where(terminated, tl.exp(-depth), 0.0))
 
 
-@triton.jit
-def _vectors(vectors, ray):
-    """Vectors of rays, an array for each axis."""
-    at = vectors + 3 * ray[:, None]
-    return tl.load(at), tl.load(at + 1), tl.load(at + 2)
-
-
 @triton.jit(do_not_specialize=("num_rays", "room"))
 def march_kernel(
     origins, directions, nears, fars, allowed, priorities, constants, grids, biases, cube, density, reliability,
@@ -95,8 +88,8 @@ def march_kernel(
     row, head_of = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, HEADS)
     exists = row < num_rays
     ray = tl.where(exists, row, 0)
-    x, y, z = _vectors(origins, ray)
-    dx, dy, dz = _vectors(directions, ray)
+    x, y, z = vectors(origins, ray[:, None])
+    dx, dy, dz = vectors(directions, ray[:, None])
     first, count, u, bend_u, v, bend_v, local_z, local_dz, is_fully_covered = cross(
         ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, constants, cube, content_near,
         K, HEADS, HAS_CUBE, ALLOWS, CHOOSES,

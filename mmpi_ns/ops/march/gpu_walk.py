@@ -89,6 +89,13 @@ def softplus(x):
 
 
 @triton.jit
+def vectors(of_rays, ray):
+    """Vectors of rays, an array for each axis."""
+    at = of_rays + 3 * ray
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2)
+
+
+@triton.jit
 def _rotate(frame, x, y, z):
     """The frame's axes times a vector, in the order of ``geometry.rotate``."""
     axes = frame + AXES
@@ -323,16 +330,21 @@ def in_cube(cube, x, y, z, dx, dy, dz, inverse_t):
 
 
 @triton.jit
+def was_trained(touched, grids, head, u, v, s, mask):
+    """Whether the texel nearest to NDC (u, v, s) was trained; not where masked."""
+    grid = grids + head * INTS
+    x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
+    row = row_of(grids, head, nearest(s, tl.load(grid + DEPTH)), y, x, mask)
+    return mask & (tl.load(touched + row, mask, 0) > 0)
+
+
+@triton.jit
 def _count_vote(vote_of_head, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick):
     """Votes on samples with that of head k: (of their own head, highest of the others, sum of e^(other - highest))."""
     is_own = head == k
     looked_up = thick & (inside | is_own)
     vote = trilinear(reliability, grids, k, u, v, s, looked_up)
-    counts = looked_up & (head != k)
-    grid = grids + k * INTS
-    x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
-    row = row_of(grids, k, nearest(s, tl.load(grid + DEPTH)), y, x, counts)
-    counts = counts & (tl.load(touched + row, counts, 0) > 0)
+    counts = was_trained(touched, grids, k, u, v, s, looked_up & (head != k))
     higher = tl.where(counts, tl.maximum(highest, vote), highest)
     # -1e30 instead of -infinity: differences of it are numbers.
     others = tl.where(counts, others * tl.exp(highest - higher) + tl.exp(vote - higher), others)
