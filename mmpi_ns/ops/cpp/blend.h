@@ -1,6 +1,7 @@
 // Optical depth of a sample after blending by reliability (blending.find_votes, blend_shares, blended_optical_depth).
 #pragma once
 #include "crossings.h"
+#include "taps.h"
 
 namespace {
 
@@ -41,30 +42,56 @@ bool place(const Scene& scene, const Packet& rays, const std::vector<Local>& loc
 
 inline float softplus(float x) { return x > 20 ? x : std::log1p(std::exp(x)); }
 
-// Optical depth of a sample of head `own` after blending.
-inline float blended(const Scene& scene, const Packet& rays, const Crossings& crossings, int ray, int64_t own,
-                     float inverse_t, float tau, std::vector<float>& votes) {
-    if (tau <= NEGLIGIBLE) return tau / float(scene.num_heads);
-    float ndc[3], vote_of_head = 0, highest = -std::numeric_limits<float>::infinity(), others = 0;
-    votes.clear();
-    for (int64_t j = 0; j < scene.num_heads; j++) {
-        if (!place(scene, rays, crossings.mpis, ray, j, inverse_t, ndc) && j != own) continue;
-        const Grid& grid = scene.grids[j];
-        if (j == own) {
-            vote_of_head = trilinear(scene.reliability, grid, ndc);
-        } else if (scene.touched[nearest_texel(grid, ndc)]) {
-            votes.push_back(trilinear(scene.reliability, grid, ndc));
-            highest = std::max(highest, votes.back());
+// The texels whose reliabilities are the votes on a sample, of each head in whose frustum it lies. They are looked up, and
+// prefetched, some time before they are read: heads have millions of texels, and neighbouring samples other ones.
+struct Votes {
+    struct Vote {
+        Sample texels;
+        int64_t head, nearest; // the nearest texel, which must be trained to vote; -1 of the sample's head, which votes
+        float value;
+    };
+    std::vector<Vote> votes;
+
+    template <typename Local>
+    void look_up(const Scene& scene, const Packet& rays, const std::vector<Local>& local, int ray, int64_t own,
+                 float inverse_t) {
+        votes.clear();
+        for (int64_t j = 0; j < scene.num_heads; j++) {
+            float ndc[3];
+            if (!place(scene, rays, local, ray, j, inverse_t, ndc) && j != own) continue;
+            Vote& vote = votes.emplace_back();
+            vote.head = j, vote.nearest = j == own ? -1 : nearest_texel(scene.grids[j], ndc);
+            vote.texels.put(scene.grids[j], true, 0, ndc);
+            __builtin_prefetch(scene.touched + vote.nearest);
+            for (int tap = 0; tap < vote.texels.taps; tap++) __builtin_prefetch(scene.reliability + vote.texels.rows[tap]);
         }
     }
-    if (votes.empty()) return tau; // the sole cover
-    for (float vote : votes) others += std::exp(vote - highest);
-    const float odds = highest - vote_of_head + std::log(others);
-    const float log_share = -softplus(odds), log_rest = -softplus(-odds);
-    const float alpha = -std::expm1(-tau) * std::exp(log_share);
-    if (alpha < 0.5f) return -std::log1p(-alpha);
-    const float a = log_rest, b = log_share - tau;
-    return std::max(-(std::max(a, b) + softplus(-std::abs(a - b))), 0.0f);
-}
+
+    static bool counts(const Scene& scene, const Vote& vote) { return vote.nearest < 0 || scene.touched[vote.nearest]; }
+
+    // The sample's optical depth after blending.
+    float blended(const Scene& scene, float tau) {
+        float vote_of_head = 0, highest = -std::numeric_limits<float>::infinity(), others = 0;
+        size_t count = 0;
+        for (size_t i = 0; i < votes.size(); i++) {
+            if (!counts(scene, votes[i])) continue;
+            float value = 0;
+            const Sample& texels = votes[i].texels;
+            for (int tap = 0; tap < texels.taps; tap++) value += texels.shares[tap] * scene.reliability[texels.rows[tap]];
+            if (votes[i].nearest < 0)
+                vote_of_head = value;
+            else
+                votes[count++].value = value, highest = std::max(highest, value);
+        }
+        if (!count) return tau; // the sole cover
+        for (size_t i = 0; i < count; i++) others += std::exp(votes[i].value - highest);
+        const float odds = highest - vote_of_head + std::log(others);
+        const float log_share = -softplus(odds), log_rest = -softplus(-odds);
+        const float alpha = -std::expm1(-tau) * std::exp(log_share);
+        if (alpha < 0.5f) return -std::log1p(-alpha);
+        const float a = log_rest, b = log_share - tau;
+        return std::max(-(std::max(a, b) + softplus(-std::abs(a - b))), 0.0f);
+    }
+};
 
 } // namespace

@@ -181,7 +181,8 @@ template <typename Texels> class Walker {
     CubeWalks cube;
     std::vector<Seen> seen[WIDTH]; // of each ray, front to back
     Lanes transmittance, dropped, least_weight, least_transmittance;
-    std::vector<float> votes, masses;
+    Votes votes[WIDTH];
+    std::vector<float> masses;
 
     Lanes next(int32_t head) const {
         return Texels::HAS_CUBE && head == scene.num_mpis ? cube.inverse_t : walks[head].inverse_t;
@@ -230,9 +231,16 @@ template <typename Texels> class Walker {
         if constexpr (Texels::HAS_CUBE) {
             Lanes tau = h == scene.num_mpis ? texels.cube_tau(cube.index, packet, going, reads)
                                             : texels.tau(h, walks[h], going, reads);
-            for (uint32_t lanes = texels.blends ? bits(going) : 0; lanes; lanes &= lanes - 1) {
-                const int i = __builtin_ctz(lanes);
-                tau[i] = blended(scene, packet, crossings, i, h, inverse_t[i], tau[i], votes);
+            if (texels.blends) {
+                const uint32_t thick = bits(going & (tau > NEGLIGIBLE));
+                for (uint32_t lanes = thick; lanes; lanes &= lanes - 1) {
+                    const int i = __builtin_ctz(lanes);
+                    votes[i].look_up(scene, packet, crossings.mpis, i, h, inverse_t[i]);
+                }
+                for (uint32_t lanes = bits(going); lanes; lanes &= lanes - 1) {
+                    const int i = __builtin_ctz(lanes);
+                    tau[i] = thick >> i & 1 ? votes[i].blended(scene, tau[i]) : tau[i] / float(scene.num_heads);
+                }
             }
             through = exp_lanes(-tau);
         } else {

@@ -133,7 +133,7 @@ class Training {
   public:
     Training(const Scene& scene, float threshold, float fair_share, bool blends)
         : scene(scene), threshold(threshold), fair_share(fair_share), blends(blends), runs(scene.num_heads),
-          waiting(scene.num_heads), nearest(scene.num_heads) {}
+          waiting(scene.num_heads), nearest(scene.num_heads), votes(scene.num_heads) {}
 
     // Marches one of sixteen rays.
     void march(const Packet& rays, const Crossings& crossings, int ray, const Samples& to, int64_t& size, float& skipped,
@@ -164,7 +164,7 @@ class Training {
             }
             float tau = run.tau[run.at], pass = run.pass[run.at];
             if (blends) {
-                tau = blended(scene, rays, crossings, ray, h, run.inverse_t[run.at], tau, votes);
+                tau = tau > NEGLIGIBLE ? votes[h].blended(scene, tau) : tau / float(scene.num_heads);
                 pass = std::exp(-tau);
             }
             const float weight = transmittance * (1 - pass);
@@ -190,16 +190,20 @@ class Training {
     std::vector<Run> runs;
     std::vector<int64_t> waiting; // heads with further samples,
     std::vector<float> nearest; // and the inverse distance of the next one of each
-    std::vector<float> votes;
+    std::vector<Votes> votes;   // on that sample
 
     void advance(Run& run, const Packet& rays, const Crossings& crossings, int ray, int64_t head) {
-        if (++run.at < run.size) return;
-        run.size = run.at = 0;
-        if (run.begin == run.count) return;
-        if (head < scene.num_mpis)
-            fill_mpi(run, scene, crossings.mpis[head], ray, head, threshold > 0);
-        else
-            fill_cube(run, scene, rays, ray, threshold > 0);
+        if (++run.at >= run.size) {
+            run.size = run.at = 0;
+            if (run.begin == run.count) return;
+            if (head < scene.num_mpis)
+                fill_mpi(run, scene, crossings.mpis[head], ray, head, threshold > 0);
+            else
+                fill_cube(run, scene, rays, ray, threshold > 0);
+            if (run.done()) return;
+        }
+        if (blends && run.tau[run.at] > NEGLIGIBLE)
+            votes[head].look_up(scene, rays, crossings.mpis, ray, head, run.next());
     }
 };
 
