@@ -67,7 +67,7 @@ class Networks(nn.Module):
 
 def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tensor, "N E"]:
     """(x, sin 2^i pi x, cos 2^i pi x) for i < frequencies (NeRF eq. 4)."""
-    angles = torch.cat([x * (math.pi * 2.0**i) for i in range(frequencies)], -1)
+    angles = torch.cat([x[:, :0], *(x * (math.pi * 2.0**i) for i in range(frequencies))], -1)
     return torch.cat([x, angles.sin(), angles.cos()], -1)
 
 
