@@ -7,6 +7,7 @@ Captures that the folder lacks are left out, and the pages name them.
 
 from __future__ import annotations
 
+import json
 import re
 import statistics
 import sys
@@ -22,10 +23,12 @@ from mmpi_ns.scripts.command import run
 ROOT = Path(__file__).resolve().parents[1]
 LPIPS = ("--pipeline.model.lpips-net", "none")
 """Its weights cannot be had everywhere."""
-PAPER = ("--max-num-iterations", "2500", "--pipeline.datamanager.train-num-rays-per-batch", "1024")
-"""The paper's 40,000 steps scaled to a sixteenth of the pixels: as many epochs, of 1,024 rays a step."""
+RAYS = ("--pipeline.datamanager.train-num-rays-per-batch", "1024")
+"""The paper does not name its rays a step."""
 JOINT = ("--pipeline.model.schedule.training", "joint")
-FACES = "--pipeline.model.placement.faces"
+FRONT = ("--pipeline.model.placement.faces", "front")
+PIECE = 64
+"""Frames of a piece of long-road, as many as kitti-street has; every third one, from the first, trains."""
 
 
 @dataclass(frozen=True)
@@ -40,24 +43,36 @@ class Variant:
     name: str = "defaults"
     table: str = "defaults"
     """Name in ``TABLES``."""
+    first: int | None = None
+    """First frame of the piece that is used; None for the whole capture."""
+
+    @property
+    def scene(self) -> str:
+        """The capture as tables name it."""
+        return self.capture + ("" if self.first is None else f" from {self.first}") + f" /{self.factor}"
 
     @property
     def key(self) -> str:
-        return f"{self.capture} /{self.factor}, {self.method}, {self.name}"
+        return f"{self.scene}, {self.method}, {self.name}"
 
 
 TABLES = {"defaults": "Defaults", "lengths": "Longer and shorter", "paper": "The paper's methods"}
 """Titles of the tables by the names of their files; each is made on one commit."""
 STREET = ("kitti-street", 4)
+
+
+def steps(count: int) -> tuple[str, str]:
+    """The option. The paper's methods take as many epochs as at full size: its steps divided by the pixels' factor."""
+    return ("--max-num-iterations", str(count))
+
+
 VARIANTS = (
-    Variant(*STREET, seeds=(0, 1, 2)),
-    Variant("kitti-street", 1),
-    Variant("kitchen", 2),
-    Variant("fox", 2),
-    Variant("room-walk", 2),
-    Variant("phone-walk", 2),
     *(
-        Variant(*scene, options=("--max-num-iterations", str(n)), name=f"{n:,} steps", table="lengths")
+        Variant(*scene, seeds=(0, 1, 2))
+        for scene in (STREET, ("kitti-street", 1), ("kitchen", 2), ("fox", 2), ("room-walk", 2), ("phone-walk", 2))
+    ),
+    *(
+        Variant(*scene, options=steps(n), name=f"{n:,} steps", table="lengths")
         for scene, lengths in (
             (STREET, (300, 600, 1250, 10_000)),
             (("kitti-street", 1), (1000, 16_000)),
@@ -69,14 +84,20 @@ VARIANTS = (
         for n in lengths
     ),
     *(
-        Variant(*STREET, "mmpi-kitti", (*PAPER, *options), name=name, table="paper")
+        Variant(capture, factor, "mmpi-kitti", (*steps(2500), *RAYS, *options), (0, 1, 2), name, "paper", first)
+        for capture, factor, first in ((*STREET, None), ("long-road", 2, 1), ("long-road", 2, 142))
         for name, options in (
-            ("one MPI (front), joint", (FACES, "front", *JOINT)),
+            ("one MPI (front), joint", (*FRONT, *JOINT)),
             ("four MPIs, joint", JOINT),
             ("four MPIs, each alone, then reliability", ()),
         )
     ),
-    Variant("kitti-street", 1, "mmpi-kitti", PAPER[2:], name="all 40,000 steps, of 1,024 rays", table="paper"),
+    Variant("kitti-street", 1, "mmpi-kitti", RAYS, name="all 40,000 steps, of 1,024 rays", table="paper"),
+    *(
+        Variant(capture, 2, method, (*steps(n), *RAYS), name=f"{n:,} steps of 1,024 rays", table="paper")
+        for capture in ("kitchen", "room-walk")
+        for method, n in (("mmpi-scannet", 7500), ("mmpi-scannet-short", 2500))
+    ),
 )
 
 
@@ -114,13 +135,29 @@ class Results(Bench):
         folder = self.folder / slug(f"{variant.key} {seed}", "-")
         options = [*LPIPS, "--machine.seed", str(seed), *variant.options]
         renders = ["--render-output-path", str(folder / "renders")]
-        scene = Scene(self.data / variant.capture, variant.factor)
+        data = self.data / variant.capture
+        scene = Scene(data if variant.first is None else piece(data, variant.first, folder / "piece"), variant.factor)
         _, results, made = train_and_evaluate(scene, folder, variant.method, options, renders, self.cores)
         row = {k: results[k] for k in ("psnr", "ssim", "field_psnr", "field_ssim") if k in results}
-        row |= {"key": variant.key, "capture": f"{variant.capture} /{variant.factor}"}
+        row |= {"key": variant.key, "capture": variant.scene}
         row |= {"name": f"`{variant.method}`" + (f", {variant.name}" if variant.name != "defaults" else "")}
         print(f"{variant.key}, seed {seed}: {row['psnr']:.2f} dB, {row['ssim']:.3f}", flush=True)
         return row | made | {"command": " ".join(["ns-train", variant.method, *options])}
+
+
+def piece(data: Path, first: int, folder: Path) -> Path:
+    """A folder with ``PIECE`` frames of a capture whose images lie in ``images``; its images are links."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for images in data.glob("images*"):
+        (folder / images.name).unlink(missing_ok=True)
+        (folder / images.name).symlink_to(images.resolve())
+    content = json.loads((data / "transforms.json").read_text(encoding="utf-8"))
+    frames = sorted(content["frames"], key=lambda frame: frame["file_path"])[first : first + PIECE]
+    names = [frame["file_path"] for frame in frames]
+    tests = [name for i, name in enumerate(names) if i % 3]
+    lists = {"train_filenames": names[::3], "val_filenames": tests, "test_filenames": tests}
+    (folder / "transforms.json").write_text(json.dumps(content | {"frames": frames} | lists), encoding="utf-8")
+    return folder
 
 
 # Tables --------------------------------------------------------------------------------------------------------------
