@@ -16,8 +16,8 @@ FEW, MANY = 2.6e6, 10.4e6
 MOST_TIMES = 3.0
 """Largest multiple of the steps."""
 GPU_MULTIPLE, RAYS_PER_PIXEL = 4.0, 4.0
-"""Factor on the rays of a run on a GPU, up to so many per training pixel: beyond, images do not improve
-(docs/results/README.md, "Longer and shorter")."""
+"""Factor on the rays of a run on a GPU; and rays per training pixel up to which a run may be longer than the default:
+beyond, images do not improve (docs/results/README.md, "Longer and shorter")."""
 RAYS_PER_PROCESSOR = 256
 """Pixel rays of a step per multiprocessor of a GPU."""
 MOST_RAYS_TIMES = 4
@@ -44,13 +44,13 @@ def rays_times(processors: int) -> int:
 
 
 def steps_for(pixels: float, size: float = 1.0, times: int = 1) -> int:
-    """Training steps of a window, in hundreds, by its training pixels (``FEW``, ``MANY``), multiplied by ``size`` and
-    divided by ``times``, the factor on the rays per step (``rays_times``). A GPU, whose ``times`` are above 1, takes
-    more rays (``GPU_MULTIPLE``)."""
+    """Training steps of a window, in hundreds, by its training pixels (``FEW``, ``MANY``), multiplied by ``size`` up to
+    ``RAYS_PER_PIXEL`` and divided by ``times``, the factor on the rays per step (``rays_times``). A GPU, whose
+    ``times`` are above 1, takes more rays (``GPU_MULTIPLE``)."""
     steps = max(LEAST_STEPS, STEPS * min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES))
-    if times > 1:
-        steps = min(GPU_MULTIPLE * steps, max(steps, RAYS_PER_PIXEL * pixels / RAYS))
-    return 100 * max(1, round(size * steps / 100)) // times
+    multiple = size * (GPU_MULTIPLE if times > 1 else 1.0)
+    steps = min(multiple * steps, max(steps, RAYS_PER_PIXEL * pixels / RAYS))
+    return 100 * max(1, round(steps / 100)) // times
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:

@@ -55,7 +55,8 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     assert most_pixels(many, windows, WindowedPlan.single(NO_PLAN)) == many.sizes.prod(-1).sum()
     steps = [steps_for(pixels) for pixels in (1e4, 0.75 * FEW, FEW, MANY, 2 * MANY, 1e12)]
     assert steps == [2500, 3000, 4000, 4000, 8000, 12000]
-    assert [steps_for(FEW, size) for size in (0.3, 4.0)] == [1200, 16000]
+    asked = ((FEW, 0.3), (MANY, 4.0), (FEW, 4.0), (1e4, 4.0))  # the last two reach four rays a pixel
+    assert [steps_for(pixels, size) for pixels, size in asked] == [1200, 16000, 10200, 2500]
 
 
 @pytest.mark.parametrize(
