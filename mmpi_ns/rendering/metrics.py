@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -30,8 +31,10 @@ class ImageMetrics:
     def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
         from nerfstudio.model_components.lib_bilagrid import color_correct  # imports tensorly: a second
 
-        corrected = color_correct(predicted.float(), observed.float())  # as in nerfstudio's splatfacto
-        values = psnr_and_ssim(predicted, observed) | {"cc_psnr": psnr(corrected, observed)}
+        values = psnr_and_ssim(predicted, observed)
+        with suppress(AssertionError):  # a grey image has no fit
+            corrected = color_correct(predicted.float(), observed.float())  # as in nerfstudio's splatfacto
+            values["cc_psnr"] = psnr(corrected, observed)
         if self._lpips is not None:
             a, b = (torch.moveaxis(x, -1, 0)[None].float().clamp(0, 1) for x in (predicted, observed))
             values[f"lpips_{self.lpips_net}"] = float(self._lpips.to(a.device)(a, b))

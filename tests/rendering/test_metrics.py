@@ -11,7 +11,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from mmpi_ns.rendering import metrics
-from mmpi_ns.rendering.metrics import pictures, psnr, ssim
+from mmpi_ns.rendering.metrics import ImageMetrics, pictures, psnr, ssim
 from mmpi_ns.rendering.pipeline import MMPIPipeline
 
 
@@ -38,6 +38,14 @@ def test_scores_do_not_depend_on_the_parts_in_which_images_are_compared(part, sh
     predicted, observed = torch.from_numpy(a), torch.from_numpy(b)
     assert ssim(predicted, observed) == pytest.approx(ssim_of(a, b), abs=1e-5)
     assert psnr(predicted, observed) == pytest.approx(-10 * np.log10(((a - b) ** 2).mean()), abs=1e-9)
+
+
+def test_a_grey_image_has_no_score_with_fitted_colours():
+    """``ns-eval`` ended in a traceback on a grey capture."""
+    generator = torch.Generator().manual_seed(0)
+    grey, noise = (torch.rand(40, 50, n, generator=generator) for n in (1, 3))
+    scores = [ImageMetrics("none")(image, noise) for image in (0.5 * grey + 0.2 + 1e-8 * noise, 0.9 * noise)]
+    assert ["cc_psnr" in each for each in scores] == [False, True]
 
 
 def test_pictures_of_more_pixels_than_torch_sorts_are_made():
