@@ -45,7 +45,7 @@ def unused_gpu() -> str:
 
 
 def processor() -> str:
-    """Cores and model of this machine's CPU, and whether it has AVX-512, without which some of one name are far slower."""
+    """Cores and model of this machine's CPU, and whether it has AVX-512: of one name, those without are far slower."""
     info = Path("/proc/cpuinfo")
     text = info.read_text(encoding="utf-8") if info.is_file() else ""
     names = re.findall(r"model name\s*: (.*)", text)
