@@ -67,9 +67,10 @@ def steps(count: int) -> tuple[str, str]:
 
 
 VARIANTS = (
+    Variant(*STREET, seeds=(0, 1, 2)),
     *(
-        Variant(*scene, seeds=(0, 1, 2))
-        for scene in (STREET, ("kitti-street", 1), ("kitchen", 2), ("fox", 2), ("room-walk", 2), ("phone-walk", 2))
+        Variant(*scene)
+        for scene in (("kitti-street", 1), ("kitchen", 2), ("fox", 2), ("room-walk", 2), ("phone-walk", 2))
     ),
     *(
         Variant(*scene, options=steps(n), name=f"{n:,} steps", table="lengths")
@@ -84,8 +85,12 @@ VARIANTS = (
         for n in lengths
     ),
     *(
-        Variant(capture, factor, "mmpi-kitti", (*steps(2500), *RAYS, *options), (0, 1, 2), name, "paper", first)
-        for capture, factor, first in ((*STREET, None), ("long-road", 2, 1), ("long-road", 2, 142))
+        Variant(capture, factor, "mmpi-kitti", (*steps(2500), *RAYS, *options), seeds, name, "paper", first)
+        for capture, factor, first, seeds in (
+            (*STREET, None, (0, 1, 2)),
+            ("long-road", 2, 1, (0,)),
+            ("long-road", 2, 142, (0,)),
+        )
         for name, options in (
             ("one MPI (front), joint", (*FRONT, *JOINT)),
             ("four MPIs, joint", JOINT),
