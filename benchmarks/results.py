@@ -231,8 +231,12 @@ def results_page(made: dict[str, Row]) -> str:
     for name, content in made.items():
         done, stamp = finished(content), stamp_line(content["made"])
         blocks += [f"**{TABLES[name]}**", *([stamp] if stamp not in blocks else []), table(columns, means(content))]
-        asked = [f"{v.key}, seed {seed}" for v in VARIANTS if v.table == name for seed in v.seeds]
-        if missing := [key for key in asked if key not in done]:
+        missing = []
+        for variant in (v for v in VARIANTS if v.table == name):
+            seeds = [seed for seed in variant.seeds if f"{variant.key}, seed {seed}" not in done]
+            some = f" (seeds {', '.join(map(str, seeds))})" if 0 < len(seeds) < len(variant.seeds) else ""
+            missing += [variant.key + some] if seeds else []
+        if missing:
             blocks += [f"Not run: {'; '.join(missing)}."]
     blocks += ["![PSNR and SSIM over seconds](results.png)"]
     return "\n\n".join(blocks)
