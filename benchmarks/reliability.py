@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from nerfstudio.cameras.rays import RayBundle
 from report import Bench, Report, Row, page, table
 from torch import Tensor, nn
@@ -58,8 +59,8 @@ class ReliabilityOf(Bench):
         report = Report(self, self.key("load_configs", "images"))
         for config in self.load_configs:
             pipeline = load_model(config)
-            data, seed = pipeline.datamanager.config.dataparser, pipeline.datamanager.config.seed
-            name = f"{Path(data.data).name} /{data.downscale_factor}, seed {seed}"
+            data, machine = pipeline.datamanager.config.dataparser, yaml.load(config.read_text(), yaml.Loader).machine
+            name = f"{Path(data.data).name} /{data.downscale_factor}, seed {machine.seed}"
             print(name, report.row(name, partial(self._row, pipeline)), flush=True)
         report.finish({}, markdown(report.content))
 
