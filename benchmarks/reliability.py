@@ -62,7 +62,7 @@ class ReliabilityOf(Bench):
             data, machine = pipeline.datamanager.config.dataparser, yaml.load(config.read_text(), yaml.Loader).machine
             name = f"{Path(data.data).name} /{data.downscale_factor}, seed {machine.seed}"
             print(name, report.row(name, partial(self._row, pipeline)), flush=True)
-        report.finish({}, markdown(report.content))
+        report.finish({}, markdown(report.content, self.images))
 
     def _row(self, pipeline: Any) -> Row:
         scores = {"the run": score(pipeline, Reliability(pipeline.model.field, 1, False), self.images)}
@@ -145,7 +145,7 @@ def score(pipeline: Any, reliability: Reliability, count: int) -> float:
     return float(np.mean(values))
 
 
-def markdown(content: Row) -> str:
+def markdown(content: Row, images: int) -> str:
     """The page: a line for each capture, seeds as their mean."""
     scenes: dict[str, list[dict[str, float]]] = {}
     for name, row in content["rows"].items():
@@ -157,7 +157,7 @@ def markdown(content: Row) -> str:
         for scene, scores in scenes.items()
     ]
     intro = (
-        "PSNR of the field, dB: of runs of `mmpi`, and after reliability alone was trained for a fifth as many steps, "
+        f"PSNR of the field, dB, on {f'at most {images} evenly spaced' if images else 'all'} test images: of runs of `mmpi`, and after reliability alone was trained for a fifth as many steps, "
         "for each texel, for each brick, or for each texel with a slope over the camera's distance from each MPI."
     )
     return page("Reliability after joint training", content["made"], intro, table(columns, lines))
