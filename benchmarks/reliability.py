@@ -156,9 +156,11 @@ def markdown(content: Row, images: int) -> str:
         {"scene": scene, "seeds": len(scores)} | {name: np.mean([s[name] for s in scores]) for name in scores[0]}
         for scene, scores in scenes.items()
     ]
+    chosen = f"at most {images} evenly spaced" if images else "all"
     intro = (
-        f"PSNR of the field, dB, on {f'at most {images} evenly spaced' if images else 'all'} test images: of runs of `mmpi`, and after reliability alone was trained for a fifth as many steps, "
-        "for each texel, for each brick, or for each texel with a slope over the camera's distance from each MPI."
+        f"PSNR of the field, dB, on {chosen} test images: of runs of `mmpi`, and after reliability alone was trained "
+        "for a fifth as many steps, for each texel, for each brick, or for each texel with a slope over the camera's "
+        "distance from each MPI."
     )
     return page("Reliability after joint training", content["made"], intro, table(columns, lines))
 

@@ -86,6 +86,13 @@ def texel_of(grids, row, mask, NUM_HEADS: tl.constexpr):
 
 
 @triton.jit
+def vectors(of_rays, ray):
+    """Vectors of rays, an array for each axis."""
+    at = of_rays + 3 * ray
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2)
+
+
+@triton.jit
 def cell(coordinate, size):
     """Lower texel and fraction of a coordinate in [-1, 1] over ``size`` texels; outside it clamps to the border."""
     last = (size - 1).to(tl.float32)

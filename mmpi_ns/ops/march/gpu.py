@@ -21,10 +21,22 @@ from torch.nn.functional import pad
 from mmpi_ns.ops import ends
 from mmpi_ns.ops.composite import ray_numbers
 from mmpi_ns.ops.gather.gpu import activate, sizes
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
+from mmpi_ns.ops.gpu_scene import (
+    DEPTH,
+    HEIGHT,
+    INTS,
+    WIDTH,
+    block_size,
+    cell,
+    grids_of,
+    launch,
+    one_minus_exp,
+    row_of,
+    vectors,
+)
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense, dense_fields
 from mmpi_ns.ops.march import MarchOptions, MergedSamples, RayOutputs, Rays, empty_samples
-from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty, vectors
+from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
 HALF = tl.constexpr(ends.HALF)

@@ -89,13 +89,6 @@ def softplus(x):
 
 
 @triton.jit
-def vectors(of_rays, ray):
-    """Vectors of rays, an array for each axis."""
-    at = of_rays + 3 * ray
-    return tl.load(at), tl.load(at + 1), tl.load(at + 2)
-
-
-@triton.jit
 def _rotate(frame, x, y, z):
     """The frame's axes times a vector, in the order of ``geometry.rotate``."""
     axes = frame + AXES

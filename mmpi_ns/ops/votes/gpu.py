@@ -8,9 +8,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, row_of
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, row_of, vectors
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense
-from mmpi_ns.ops.march.gpu_walk import in_cube, in_mpi, vectors, was_trained
+from mmpi_ns.ops.march.gpu_walk import in_cube, in_mpi, was_trained
 from mmpi_ns.ops.votes import Votes, empty_votes
 
 PAIRS = 128
