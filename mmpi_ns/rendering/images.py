@@ -17,6 +17,7 @@ CPU_RAYS = 4096
 system after each use."""
 FUSED_RAYS = 4 * CPU_RAYS
 """Rays of a chunk on a CPU if images are rendered in one pass without arrays of samples (``ops.march``)."""
+SQUARE = 4
 GPU_RAYS = 1 << 20
 """Most rays of a chunk on a GPU: a frame of 1242 x 375, or half of one of 1920 x 1080."""
 BYTES_PER_SAMPLE = 128
@@ -94,3 +95,9 @@ def render_in_chunks(
         for name, values in render(rays[start : start + size].to(device)).items():
             parts[name].append(values.to(bundle.origins.device))
     return {name: torch.cat(values).view(*bundle.shape, -1) for name, values in parts.items()}
+
+
+def neighbours_first(shape):
+    """Numbers of an image's rays, square by square."""
+    y, x = (n // SQUARE for n in torch.meshgrid(*map(torch.arange, shape), indexing="ij"))
+    return (y * shape[1] + x).flatten().sort(stable=True).indices

@@ -24,6 +24,8 @@ struct Packet {
     Lanes origin[3], direction[3], near, far;
     Mask there;
 
+    Packet() = default;
+
     Packet(const Rays& rays, int64_t first, int64_t some) : there(IOTA < float(some)) {
         for (int64_t i = 0; i < WIDTH; i++) numbers[i] = first + std::min(i, some - 1);
         for (int a = 0; a < 3; a++) {

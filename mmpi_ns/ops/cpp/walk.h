@@ -152,11 +152,32 @@ template <typename Texels> class Walker {
     explicit Walker(const Texels& texels)
         : texels(texels), scene(texels.scene), walks(scene.num_mpis), masses(scene.num_heads) {}
 
-    void render(const Rays& rays, int64_t first, int64_t some, const Outputs& to) {
-        const Packet packet(rays, first, some);
-        begin(rays, packet);
-        walk(packet);
-        finish();
+    // Starts with `some` rays from number `first` on.
+    void begin(const Rays& rays, int64_t first, int64_t some) {
+        packet = Packet(rays, first, some);
+        this->first = first, this->some = some;
+        start(rays);
+    }
+
+    // The ray with the nearest next sample goes first, with all rays whose next sample is in the same head: so they
+    // stay abreast, and each takes its samples in order. False where none has a next sample.
+    bool advance() {
+        Lanes top = next(0);
+        IntLanes best{};
+        for (int32_t h = 1; h < scene.num_heads; h++) { // ties: the first head
+            best = pick(next(h) > top, whole(h), best);
+            top = most(next(h), top);
+        }
+        const Mask active = (top >= 0) & ~(transmittance <= least_transmittance); // not is_terminated
+        if (!any(active)) return false;
+        const Lanes waiting = pick(active, top, splat(-1));
+        const int32_t h = best[__builtin_ctz(bits(waiting == largest(waiting)))];
+        step(h, active & (best == h));
+        return true;
+    }
+
+    void finish(const Outputs& to) {
+        end();
         for (int64_t i = 0; i < some; i++) {
             sum(seen[i], first + i, to);
             to.transmittance[first + i] = transmittance[i], to.accumulation[first + i] = 1 - transmittance[i];
@@ -176,6 +197,8 @@ template <typename Texels> class Walker {
 
     const Texels& texels;
     const Scene& scene;
+    Packet packet;
+    int64_t first = 0, some = 0;
     Crossings crossings;
     std::vector<Walks<Texels::CELLS>> walks;
     CubeWalks cube;
@@ -188,7 +211,7 @@ template <typename Texels> class Walker {
         return Texels::HAS_CUBE && head == scene.num_mpis ? cube.inverse_t : walks[head].inverse_t;
     }
 
-    void begin(const Rays& rays, const Packet& packet) {
+    void start(const Rays& rays) {
         crossings.cross(scene, rays, packet);
         transmittance = splat(1), dropped = Lanes{};
         for (auto& samples : seen) samples.clear();
@@ -205,26 +228,8 @@ template <typename Texels> class Walker {
         }
     }
 
-    // The ray with the nearest next sample goes first, with all rays whose next sample is in the same head: so they
-    // stay abreast, and each takes its samples in order.
-    void walk(const Packet& packet) {
-        for (;;) {
-            Lanes top = next(0);
-            IntLanes best{};
-            for (int32_t h = 1; h < scene.num_heads; h++) { // ties: the first head
-                best = pick(next(h) > top, whole(h), best);
-                top = most(next(h), top);
-            }
-            const Mask active = (top >= 0) & ~(transmittance <= least_transmittance); // not is_terminated
-            if (!any(active)) return;
-            const Lanes waiting = pick(active, top, splat(-1));
-            const int32_t h = best[__builtin_ctz(bits(waiting == largest(waiting)))];
-            step(h, active & (best == h), packet);
-        }
-    }
-
     // Takes the next sample of one head for the rays of `going`.
-    void step(int32_t h, Mask going, const Packet& packet) {
+    void step(int32_t h, Mask going) {
         const Lanes inverse_t = next(h);
         Reads reads;
         Lanes through;
@@ -265,7 +270,7 @@ template <typename Texels> class Walker {
     }
 
     // The transmittance of a terminated ray bounds the weights of the rest of its samples.
-    void finish() {
+    void end() {
         Mask rest = transmittance <= least_transmittance;
         if (!Texels::ENDS_DARK) {
             Mask unseen = cube.inverse_t >= 0;
@@ -314,12 +319,22 @@ template <typename Texels> class Walker {
     }
 };
 
-// Rays [begin, end).
+// Rays [begin, end): two walks in turn, so that one computes while the other waits for memory.
 template <typename Texels>
 void render(const Texels& texels, const Rays& rays, int64_t begin, int64_t end, const Outputs& to) {
-    Walker<Texels> walker(texels);
-    for (int64_t ray = begin; ray < end; ray += WIDTH)
-        walker.render(rays, ray, std::min<int64_t>(WIDTH, end - ray), to);
+    Walker<Texels> first(texels), second(texels);
+    for (int64_t ray = begin; ray < end; ray += 2 * WIDTH) {
+        const int64_t next = std::min(ray + WIDTH, end), rest = std::min<int64_t>(WIDTH, end - next);
+        first.begin(rays, ray, next - ray);
+        bool goes = true, follows = rest > 0;
+        if (follows) second.begin(rays, next, rest);
+        while (goes || follows) {
+            if (goes) goes = first.advance();
+            if (follows) follows = second.advance();
+        }
+        first.finish(to);
+        if (rest > 0) second.finish(to);
+    }
 }
 
 } // namespace

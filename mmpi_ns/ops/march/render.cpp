@@ -55,14 +55,23 @@ struct Floats {
         IntLanes column, row;
         Lanes fx, fy;
         walk.cell(stacks[k], column, row, fx, fy);
-        const IntLanes tile = pick(going, walk.brick, IntLanes{});
+        const IntLanes tile = pick(going, walk.brick * CORNERS, IntLanes{});
+        column = pick(going, column, IntLanes{}), row = pick(going, row, IntLanes{});
+        const Mask beyond_right = column == CELLS - 1, beyond_below = row == CELLS - 1;
+        const bool right = any(beyond_right), below = any(beyond_below);
+        const IntLanes first = gather(bricks, tile) * int32_t(BRICK);
+        const auto neighbour = [&](int which) { return gather(bricks + which, tile) * int32_t(BRICK); };
+        const IntLanes at = row * CELLS + column;
+        const IntLanes beside = right ? pick(beyond_right, neighbour(1) - CELLS, first) : first;
+        const IntLanes under = below ? pick(beyond_below, neighbour(2) - CELLS * CELLS, first) : first;
+        IntLanes across = right ? pick(beyond_below, under - CELLS, beside) : under;
+        if (right && below) across = pick(beyond_right & beyond_below, neighbour(3) - CELLS * CELLS - CELLS, pick(beyond_right, beside, under));
+        else if (right) across = beside;
         reads.taps = CORNERS;
-        for (int tap = 0; tap < CORNERS; tap++) {
-            const IntLanes x = pick(going, column, IntLanes{}) + (tap & 1), y = pick(going, row, IntLanes{}) + (tap >> 1);
-            const IntLanes at = tile * CORNERS + (y >> 3) * 2 + (x >> 3);
-            reads.rows[tap] = gather(bricks, at) * int32_t(BRICK) + ((y & 7) << 3) + (x & 7);
+        reads.rows[0] = first + at, reads.rows[1] = beside + at + 1;
+        reads.rows[2] = under + at + CELLS, reads.rows[3] = across + at + CELLS + 1;
+        for (int tap = 0; tap < CORNERS; tap++)
             reads.shares[tap] = (tap & 1 ? fx : 1 - fx) * (tap >> 1 ? fy : 1 - fy);
-        }
         const Lanes bias = gather(scene.biases + scene.grids[k].bias, pick(going, walk.plane, IntLanes{}));
         return softplus_lanes(raw(reads) + bias) * scene.mpis[k].interval;
     }
