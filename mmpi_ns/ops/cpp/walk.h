@@ -150,7 +150,7 @@ struct Outputs {
 template <typename Texels> class Walker {
   public:
     explicit Walker(const Texels& texels)
-        : texels(texels), scene(texels.scene), walks(scene.num_mpis), masses(scene.num_heads) {}
+        : texels(texels), scene(texels.scene), walks(scene.num_mpis), ahead(scene.num_mpis), masses(scene.num_heads) {}
 
     // Starts with `some` rays from number `first` on.
     void begin(const Rays& rays, int64_t first, int64_t some) {
@@ -201,6 +201,7 @@ template <typename Texels> class Walker {
     int64_t first = 0, some = 0;
     Crossings crossings;
     std::vector<Walks<Texels::CELLS>> walks;
+    std::vector<typename Texels::Ahead> ahead;
     CubeWalks cube;
     std::vector<Seen> seen[WIDTH]; // of each ray, front to back
     Lanes transmittance, dropped, least_weight, least_transmittance;
@@ -220,7 +221,9 @@ template <typename Texels> class Walker {
         const auto transmittances = [&](int32_t samples) { return bounds(samples).transmittance; };
         least_transmittance = each_lane<Lanes>(crossings.total, transmittances);
         for (int64_t k = 0; k < scene.num_mpis; k++)
+{
             walks[k].begin(texels.columns, texels.stacks[k], crossings.mpis[k], packet.there);
+            if constexpr (Texels::HAS_CUBE) ahead[k]={}, texels.look_ahead(k, walks[k], packet.there & (walks[k].inverse_t >= 0), ahead[k]);}
         if constexpr (Texels::HAS_CUBE) {
             cube.inverse_t = splat(-1), cube.index = crossings.cube.first;
             cube.last = cube.index + crossings.cube.count - 1;
@@ -235,7 +238,7 @@ template <typename Texels> class Walker {
         Lanes through;
         if constexpr (Texels::HAS_CUBE) {
             Lanes tau = h == scene.num_mpis ? texels.cube_tau(cube.index, packet, going, reads)
-                                            : texels.tau(h, walks[h], going, reads);
+                                            : texels.tau(h, walks[h], going, ahead[h], reads);
             if (texels.blends) {
                 const uint32_t thick = bits(going & (tau > NEGLIGIBLE));
                 for (uint32_t lanes = thick; lanes; lanes &= lanes - 1) {
@@ -265,8 +268,10 @@ template <typename Texels> class Walker {
         transmittance *= through;
         if (Texels::HAS_CUBE && h == scene.num_mpis)
             cube.index -= going, cube.arrive(*scene.cube, going);
-        else
+        else {
             walks[h].next(texels.columns, texels.stacks[h], going);
+            if constexpr (Texels::HAS_CUBE) texels.look_ahead(h, walks[h], going & (walks[h].inverse_t >= 0), ahead[h]);
+        }
     }
 
     // The transmittance of a terminated ray bounds the weights of the rest of its samples.

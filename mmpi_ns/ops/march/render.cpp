@@ -51,7 +51,13 @@ struct Floats {
 
     Bounds bounds(int32_t samples) const { return Bounds::exact(threshold, fair_share, samples); }
 
-    Lanes tau(int32_t k, const Walks<CELLS>& walk, Mask going, Reads& reads) const {
+    // What the next samples of sixteen rays in an MPI read, looked up and prefetched before it is needed.
+    struct Ahead {
+        IntLanes rows[CORNERS];
+        Lanes fx, fy;
+    };
+
+    void look_ahead(int32_t k, const Walks<CELLS>& walk, Mask going, Ahead& to) const {
         IntLanes column, row;
         Lanes fx, fy;
         walk.cell(stacks[k], column, row, fx, fy);
@@ -67,9 +73,18 @@ struct Floats {
         IntLanes across = right ? pick(beyond_below, under - CELLS, beside) : under;
         if (right && below) across = pick(beyond_right & beyond_below, neighbour(3) - CELLS * CELLS - CELLS, pick(beyond_right, beside, under));
         else if (right) across = beside;
+        to.rows[0] = pick(going, first + at, to.rows[0]), to.rows[1] = pick(going, beside + at + 1, to.rows[1]);
+        to.rows[2] = pick(going, under + at + CELLS, to.rows[2]);
+        to.rows[3] = pick(going, across + at + CELLS + 1, to.rows[3]);
+        to.fx = pick(going, fx, to.fx), to.fy = pick(going, fy, to.fy);
+        for (int i = 0; i < WIDTH; i++)
+            __builtin_prefetch(scene.density + to.rows[0][i]), __builtin_prefetch(scene.density + to.rows[2][i]);
+    }
+
+    Lanes tau(int32_t k, const Walks<CELLS>& walk, Mask going, const Ahead& ahead, Reads& reads) const {
+        const Lanes fx = ahead.fx, fy = ahead.fy;
         reads.taps = CORNERS;
-        reads.rows[0] = first + at, reads.rows[1] = beside + at + 1;
-        reads.rows[2] = under + at + CELLS, reads.rows[3] = across + at + CELLS + 1;
+        for (int tap = 0; tap < CORNERS; tap++) reads.rows[tap] = ahead.rows[tap];
         for (int tap = 0; tap < CORNERS; tap++)
             reads.shares[tap] = (tap & 1 ? fx : 1 - fx) * (tap >> 1 ? fy : 1 - fy);
         const Lanes bias = gather(scene.biases + scene.grids[k].bias, pick(going, walk.plane, IntLanes{}));
