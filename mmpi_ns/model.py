@@ -24,7 +24,7 @@ from mmpi_ns.ops.march import Capacity, MarchOptions
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
-from mmpi_ns.rendering.images import neighbours_first, rays_per_chunk, render_in_chunks, render_windows
+from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows, square_by_square
 from mmpi_ns.rendering.metrics import ImageMetrics, pictures, psnr_and_ssim
 from mmpi_ns.rendering.rendered import BACKGROUNDS, Exposures, background_of, bounded, render_outputs, render_rays
 from mmpi_ns.rendering.window_store import WindowStore
@@ -216,10 +216,10 @@ class MMPIModel(Model):
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
         """Renders an image: window by window, in chunks of the configured size or of one that suits the device."""
         with torch_apart():
-            order = neighbours_first(camera_ray_bundle.shape)
+            order = square_by_square(*camera_ray_bundle.shape, camera_ray_bundle.origins.device)
             outputs = self.image_outputs(camera_ray_bundle.flatten()[order], self.chunk_size)
-            back = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
-            outputs = {name: values[back].view(*camera_ray_bundle.shape, -1) for name, values in outputs.items()}
+            shape = (*camera_ray_bundle.shape, -1)
+            outputs = {k: torch.empty_like(v).index_copy_(0, order, v).view(shape) for k, v in outputs.items()}
             if self.details is None or self.progress.windows.find(self.show.value) is not None:
                 return outputs
             nearest = self.config.rendering.nearest_images

@@ -17,13 +17,14 @@ CPU_RAYS = 4096
 system after each use."""
 FUSED_RAYS = 4 * CPU_RAYS
 """Rays of a chunk on a CPU if images are rendered in one pass without arrays of samples (``ops.march``)."""
-SQUARE = 4
 GPU_RAYS = 1 << 20
 """Most rays of a chunk on a GPU: a frame of 1242 x 375, or half of one of 1920 x 1080."""
 BYTES_PER_SAMPLE = 128
 """Peak bytes per plane that a ray may intersect: hits, kept samples, colours."""
 BYTES_PER_SLOT = 40
 """Bytes of one compiled pass per sample that a ray may keep."""
+SQUARE = 4
+"""Sides of the squares of pixels that are rendered together: they read the same texels."""
 FREE_SHARE = 0.5
 """Fraction of the device's free memory; the rest is left to other programs."""
 
@@ -97,7 +98,7 @@ def render_in_chunks(
     return {name: torch.cat(values).view(*bundle.shape, -1) for name, values in parts.items()}
 
 
-def neighbours_first(shape):
-    """Numbers of an image's rays, square by square."""
-    y, x = (n // SQUARE for n in torch.meshgrid(*map(torch.arange, shape), indexing="ij"))
-    return (y * shape[1] + x).flatten().sort(stable=True).indices
+def square_by_square(height: int, width: int, device: torch.device) -> Int[Tensor, "R"]:
+    """Numbers of an image's pixels (row by row), in the order of squares of ``SQUARE`` pixels."""
+    y, x = torch.arange(height, device=device) // SQUARE, torch.arange(width, device=device) // SQUARE
+    return (y[:, None] * width + x).flatten().sort(stable=True).indices

@@ -150,13 +150,28 @@ struct Outputs {
 template <typename Texels> class Walker {
   public:
     explicit Walker(const Texels& texels)
-        : texels(texels), scene(texels.scene), walks(scene.num_mpis), ahead(scene.num_mpis), masses(scene.num_heads) {}
+        : texels(texels), scene(texels.scene), walks(scene.num_mpis), reads(scene.num_heads), masses(scene.num_heads) {}
 
     // Starts with `some` rays from number `first` on.
     void begin(const Rays& rays, int64_t first, int64_t some) {
         packet = Packet(rays, first, some);
         this->first = first, this->some = some;
-        start(rays);
+        crossings.cross(scene, rays, packet);
+        transmittance = splat(1), dropped = Lanes{};
+        for (auto& samples : seen) samples.clear();
+        const auto bounds = [&](int32_t samples) { return texels.bounds(samples); };
+        least_weight = each_lane<Lanes>(crossings.total, [&](int32_t samples) { return bounds(samples).weight; });
+        const auto transmittances = [&](int32_t samples) { return bounds(samples).transmittance; };
+        least_transmittance = each_lane<Lanes>(crossings.total, transmittances);
+        for (int64_t k = 0; k < scene.num_mpis; k++) {
+            walks[k].begin(texels.columns, texels.stacks[k], crossings.mpis[k], packet.there);
+            look_ahead(k, packet.there);
+        }
+        if constexpr (Texels::HAS_CUBE) {
+            cube.inverse_t = splat(-1), cube.index = crossings.cube.first;
+            cube.last = cube.index + crossings.cube.count - 1;
+            if (scene.num_heads > scene.num_mpis) cube.arrive(*scene.cube, packet.there);
+        }
     }
 
     // The ray with the nearest next sample goes first, with all rays whose next sample is in the same head: so they
@@ -176,8 +191,16 @@ template <typename Texels> class Walker {
         return true;
     }
 
+    // The transmittance of a terminated ray bounds the weights of the rest of its samples.
     void finish(const Outputs& to) {
-        end();
+        Mask rest = transmittance <= least_transmittance;
+        if (!Texels::ENDS_DARK) {
+            Mask unseen = cube.inverse_t >= 0;
+            for (const auto& walk : walks) unseen |= walk.inverse_t >= 0;
+            rest = unseen;
+        }
+        dropped += pick(rest, transmittance, Lanes{});
+        if (Texels::ENDS_DARK) transmittance = pick(rest, Lanes{}, transmittance);
         for (int64_t i = 0; i < some; i++) {
             sum(seen[i], first + i, to);
             to.transmittance[first + i] = transmittance[i], to.accumulation[first + i] = 1 - transmittance[i];
@@ -201,7 +224,7 @@ template <typename Texels> class Walker {
     int64_t first = 0, some = 0;
     Crossings crossings;
     std::vector<Walks<Texels::CELLS>> walks;
-    std::vector<typename Texels::Ahead> ahead;
+    std::vector<Reads> reads; // of the next samples in each head
     CubeWalks cube;
     std::vector<Seen> seen[WIDTH]; // of each ray, front to back
     Lanes transmittance, dropped, least_weight, least_transmittance;
@@ -212,33 +235,14 @@ template <typename Texels> class Walker {
         return Texels::HAS_CUBE && head == scene.num_mpis ? cube.inverse_t : walks[head].inverse_t;
     }
 
-    void start(const Rays& rays) {
-        crossings.cross(scene, rays, packet);
-        transmittance = splat(1), dropped = Lanes{};
-        for (auto& samples : seen) samples.clear();
-        const auto bounds = [&](int32_t samples) { return texels.bounds(samples); };
-        least_weight = each_lane<Lanes>(crossings.total, [&](int32_t samples) { return bounds(samples).weight; });
-        const auto transmittances = [&](int32_t samples) { return bounds(samples).transmittance; };
-        least_transmittance = each_lane<Lanes>(crossings.total, transmittances);
-        for (int64_t k = 0; k < scene.num_mpis; k++)
-{
-            walks[k].begin(texels.columns, texels.stacks[k], crossings.mpis[k], packet.there);
-            if constexpr (Texels::HAS_CUBE) ahead[k]={}, texels.look_ahead(k, walks[k], packet.there & (walks[k].inverse_t >= 0), ahead[k]);}
-        if constexpr (Texels::HAS_CUBE) {
-            cube.inverse_t = splat(-1), cube.index = crossings.cube.first;
-            cube.last = cube.index + crossings.cube.count - 1;
-            if (scene.num_heads > scene.num_mpis) cube.arrive(*scene.cube, packet.there);
-        }
-    }
-
     // Takes the next sample of one head for the rays of `going`.
     void step(int32_t h, Mask going) {
         const Lanes inverse_t = next(h);
-        Reads reads;
+        Reads& at = reads[h];
         Lanes through;
         if constexpr (Texels::HAS_CUBE) {
-            Lanes tau = h == scene.num_mpis ? texels.cube_tau(cube.index, packet, going, reads)
-                                            : texels.tau(h, walks[h], going, ahead[h], reads);
+            Lanes tau = h == scene.num_mpis ? texels.cube_tau(cube.index, packet, going, at)
+                                            : texels.tau(h, walks[h], going, at);
             if (texels.blends) {
                 const uint32_t thick = bits(going & (tau > NEGLIGIBLE));
                 for (uint32_t lanes = thick; lanes; lanes &= lanes - 1) {
@@ -252,38 +256,32 @@ template <typename Texels> class Walker {
             }
             through = exp_lanes(-tau);
         } else {
-            through = texels.through(h, walks[h], going, reads);
+            through = texels.through(h, going, at);
         }
         through = pick(going, through, splat(1));
         const Lanes weight = transmittance * (1 - through);
-        texels.weighed(reads, weight);
+        texels.weighed(at, weight);
         const Mask kept = going & (weight > least_weight);
         for (uint32_t lanes = bits(kept); lanes; lanes &= lanes - 1) {
             const int i = __builtin_ctz(lanes);
             Seen& sample = seen[i].emplace_back(); // written in place: a copy would wait for the store
             sample.weight = weight[i], sample.inverse_t = inverse_t[i], sample.head = h;
-            texels.look_up(reads, i, sample.lookup);
+            texels.look_up(at, i, sample.lookup);
         }
         dropped += pick(kept, Lanes{}, weight);
         transmittance *= through;
-        if (Texels::HAS_CUBE && h == scene.num_mpis)
+        if (Texels::HAS_CUBE && h == scene.num_mpis) {
             cube.index -= going, cube.arrive(*scene.cube, going);
-        else {
+        } else {
             walks[h].next(texels.columns, texels.stacks[h], going);
-            if constexpr (Texels::HAS_CUBE) texels.look_ahead(h, walks[h], going & (walks[h].inverse_t >= 0), ahead[h]);
+            look_ahead(h, going);
         }
     }
 
-    // The transmittance of a terminated ray bounds the weights of the rest of its samples.
-    void end() {
-        Mask rest = transmittance <= least_transmittance;
-        if (!Texels::ENDS_DARK) {
-            Mask unseen = cube.inverse_t >= 0;
-            for (const auto& walk : walks) unseen |= walk.inverse_t >= 0;
-            rest = unseen;
-        }
-        dropped += pick(rest, transmittance, Lanes{});
-        if (Texels::ENDS_DARK) transmittance = pick(rest, Lanes{}, transmittance);
+    // What the next samples of the rays of `going` read in an MPI is looked up and prefetched now: other heads, and the
+    // other walk, come first.
+    void look_ahead(int64_t k, Mask going) {
+        texels.look_ahead(k, walks[k], going & (walks[k].inverse_t >= 0), reads[k]);
     }
 
     void gather(const std::vector<Seen>& samples, float* to) const {
@@ -330,12 +328,12 @@ void render(const Texels& texels, const Rays& rays, int64_t begin, int64_t end, 
     Walker<Texels> first(texels), second(texels);
     for (int64_t ray = begin; ray < end; ray += 2 * WIDTH) {
         const int64_t next = std::min(ray + WIDTH, end), rest = std::min<int64_t>(WIDTH, end - next);
+        bool first_goes = true, second_goes = rest > 0;
         first.begin(rays, ray, next - ray);
-        bool goes = true, follows = rest > 0;
-        if (follows) second.begin(rays, next, rest);
-        while (goes || follows) {
-            if (goes) goes = first.advance();
-            if (follows) follows = second.advance();
+        if (second_goes) second.begin(rays, next, rest);
+        while (first_goes || second_goes) {
+            first_goes = first_goes && first.advance();
+            second_goes = second_goes && second.advance();
         }
         first.finish(to);
         if (rest > 0) second.finish(to);

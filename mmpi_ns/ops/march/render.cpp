@@ -51,42 +51,34 @@ struct Floats {
 
     Bounds bounds(int32_t samples) const { return Bounds::exact(threshold, fair_share, samples); }
 
-    // What the next samples of sixteen rays in an MPI read, looked up and prefetched before it is needed.
-    struct Ahead {
-        IntLanes rows[CORNERS];
+    // Texels beyond the right and lower borders of a brick are in other bricks, which are looked up if a ray needs them.
+    void look_ahead(int64_t k, const Walks<CELLS>& walk, Mask going, Reads& reads) const {
+        constexpr int32_t LINE = CELLS, ALL = CELLS * CELLS; // texels
+        IntLanes x, y;
         Lanes fx, fy;
-    };
-
-    void look_ahead(int32_t k, const Walks<CELLS>& walk, Mask going, Ahead& to) const {
-        IntLanes column, row;
-        Lanes fx, fy;
-        walk.cell(stacks[k], column, row, fx, fy);
+        walk.cell(stacks[k], x, y, fx, fy);
+        x = pick(going, x, IntLanes{}), y = pick(going, y, IntLanes{});
         const IntLanes tile = pick(going, walk.brick * CORNERS, IntLanes{});
-        column = pick(going, column, IntLanes{}), row = pick(going, row, IntLanes{});
-        const Mask beyond_right = column == CELLS - 1, beyond_below = row == CELLS - 1;
-        const bool right = any(beyond_right), below = any(beyond_below);
-        const IntLanes first = gather(bricks, tile) * int32_t(BRICK);
-        const auto neighbour = [&](int which) { return gather(bricks + which, tile) * int32_t(BRICK); };
-        const IntLanes at = row * CELLS + column;
-        const IntLanes beside = right ? pick(beyond_right, neighbour(1) - CELLS, first) : first;
-        const IntLanes under = below ? pick(beyond_below, neighbour(2) - CELLS * CELLS, first) : first;
-        IntLanes across = right ? pick(beyond_below, under - CELLS, beside) : under;
-        if (right && below) across = pick(beyond_right & beyond_below, neighbour(3) - CELLS * CELLS - CELLS, pick(beyond_right, beside, under));
-        else if (right) across = beside;
-        to.rows[0] = pick(going, first + at, to.rows[0]), to.rows[1] = pick(going, beside + at + 1, to.rows[1]);
-        to.rows[2] = pick(going, under + at + CELLS, to.rows[2]);
-        to.rows[3] = pick(going, across + at + CELLS + 1, to.rows[3]);
-        to.fx = pick(going, fx, to.fx), to.fy = pick(going, fy, to.fy);
-        for (int i = 0; i < WIDTH; i++)
-            __builtin_prefetch(scene.density + to.rows[0][i]), __builtin_prefetch(scene.density + to.rows[2][i]);
+        const auto brick = [&](int corner) { return gather(bricks + corner, tile) * int32_t(BRICK); };
+        const Mask leaves_right = x == CELLS - 1, leaves_below = y == CELLS - 1;
+        const bool right = any(leaves_right), below = any(leaves_below);
+        IntLanes bases[CORNERS];
+        bases[0] = bases[1] = bases[2] = brick(0);
+        if (right) bases[1] = pick(leaves_right, brick(1) - LINE, bases[0]);
+        if (below) bases[2] = pick(leaves_below, brick(2) - ALL, bases[0]);
+        bases[3] = pick(leaves_right, bases[1], bases[2]);
+        if (right && below) bases[3] = pick(leaves_right & leaves_below, brick(3) - LINE - ALL, bases[3]);
+        reads.taps = CORNERS;
+        for (int tap = 0; tap < CORNERS; tap++) {
+            const IntLanes row = bases[tap] + (y + (tap >> 1)) * LINE + x + (tap & 1);
+            const Lanes share = (tap & 1 ? fx : 1 - fx) * (tap >> 1 ? fy : 1 - fy);
+            reads.rows[tap] = pick(going, row, reads.rows[tap]), reads.shares[tap] = pick(going, share, reads.shares[tap]);
+        }
+        for (const int tap : {0, 2})
+            for (int i = 0; i < WIDTH; i++) __builtin_prefetch(scene.density + reads.rows[tap][i]);
     }
 
-    Lanes tau(int32_t k, const Walks<CELLS>& walk, Mask going, const Ahead& ahead, Reads& reads) const {
-        const Lanes fx = ahead.fx, fy = ahead.fy;
-        reads.taps = CORNERS;
-        for (int tap = 0; tap < CORNERS; tap++) reads.rows[tap] = ahead.rows[tap];
-        for (int tap = 0; tap < CORNERS; tap++)
-            reads.shares[tap] = (tap & 1 ? fx : 1 - fx) * (tap >> 1 ? fy : 1 - fy);
+    Lanes tau(int32_t k, const Walks<CELLS>& walk, Mask going, const Reads& reads) const {
         const Lanes bias = gather(scene.biases + scene.grids[k].bias, pick(going, walk.plane, IntLanes{}));
         return softplus_lanes(raw(reads) + bias) * scene.mpis[k].interval;
     }

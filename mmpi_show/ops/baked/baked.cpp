@@ -65,10 +65,16 @@ struct Bytes {
 
     Bounds bounds(int32_t) const { return {threshold, OPAQUE_BAKED}; }
 
-    Lanes through(int32_t k, const Walks<CELLS>& walk, Mask going, Reads& reads) const {
+    void look_ahead(int64_t k, const Walks<CELLS>& walk, Mask going, Reads& reads) const {
         IntLanes column, row;
-        walk.cell(stacks[k], column, row, reads.fx, reads.fy);
-        reads.texel = pick(going, walk.brick * 64 + row * 8 + column, IntLanes{});
+        Lanes fx, fy;
+        walk.cell(stacks[k], column, row, fx, fy);
+        reads.texel = pick(going, walk.brick * 64 + row * 8 + column, reads.texel);
+        reads.fx = pick(going, fx, reads.fx), reads.fy = pick(going, fy, reads.fy);
+        for (int i = 0; i < WIDTH; i++) __builtin_prefetch(baked.density + reads.texel[i]);
+    }
+
+    Lanes through(int32_t k, Mask going, const Reads& reads) const {
         const auto pair = [this](int32_t at) { // a texel and the one right of it, in the lowest bytes
             int32_t codes;
             __builtin_memcpy(&codes, baked.density + at, sizeof codes);
