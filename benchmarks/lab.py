@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import statistics
 import subprocess
 import sys
@@ -85,7 +86,7 @@ def train_and_evaluate(
 ) -> tuple[Path, dict[str, Any], dict[str, Any]]:
     """``ns-train`` with some options, and ``ns-eval`` with what is asked, as a user types them; logs are in the folder.
 
-    The cache is empty but for the compiled operations, so that priors are computed.
+    The cache is empty but for the compiled operations, so that priors are computed. An unfinished run is deleted.
 
     Returns:
         The run's folder, the results of ns-eval, and for the row: what training took, threads, machine and commit.
@@ -93,6 +94,8 @@ def train_and_evaluate(
     train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
     place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
     size = ["--data", str(scene.data), "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
+    run, results = folder / "run" / method / "1", folder / "eval.json"
+    shutil.rmtree(run, ignore_errors=True)
     with TemporaryDirectory() as cache:
         for operations in (build.OPS, Path(mmpi_priors.ops.__file__).parent):
             build.library(operations)
@@ -102,7 +105,6 @@ def train_and_evaluate(
             copied.symlink_to(library)
         command = [train, method, *place, *options, *size]
         used = run_command(command, folder / "train.log", threads, XDG_CACHE_HOME=cache)
-    run, results = folder / "run" / method / "1", folder / "eval.json"
     words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(results), *asked]
     run_command(words, folder / "eval.log", threads)
     made = {"train_seconds": used.seconds, "processor_seconds": used.processor_seconds, "gib": used.gib}

@@ -56,7 +56,12 @@ class Variant:
         return f"{self.scene}, {self.method}, {self.name}"
 
 
-TABLES = {"defaults": "Defaults", "lengths": "Longer and shorter", "paper": "The paper's methods"}
+TABLES = {
+    "defaults": "Defaults",
+    "sizes": "`--pipeline.model.size 4`",
+    "lengths": "Longer and shorter",
+    "paper": "The paper's methods",
+}
 """Titles of the tables by the names of their files; each is made on one commit."""
 STREET = ("kitti-street", 4)
 
@@ -66,12 +71,10 @@ def steps(count: int) -> tuple[str, str]:
     return ("--max-num-iterations", str(count))
 
 
+SCENES = (STREET, ("kitti-street", 1), ("kitchen", 2), ("fox", 2), ("room-walk", 2), ("phone-walk", 2))
 VARIANTS = (
-    Variant(*STREET, seeds=(0, 1, 2)),
-    *(
-        Variant(*scene)
-        for scene in (("kitti-street", 1), ("kitchen", 2), ("fox", 2), ("room-walk", 2), ("phone-walk", 2))
-    ),
+    *(Variant(*scene, seeds=(0, 1, 2) if scene is STREET else (0,)) for scene in SCENES),
+    *(Variant(*scene, options=("--pipeline.model.size", "4"), name="size 4", table="sizes") for scene in SCENES),
     *(
         Variant(*scene, options=steps(n), name=f"{n:,} steps", table="lengths")
         for scene, lengths in (
@@ -261,7 +264,7 @@ def draw(path: Path, made: dict[str, Row], scored: Row) -> None:
     """PSNR and SSIM over seconds of training on one capture: ours by length, and other programs."""
     capture = f"{STREET[0]} /{STREET[1]}"
     ours = {name: [r for r in means(content) if r["capture"] == capture] for name, content in made.items()}
-    paper = ours.pop("paper", [])
+    paper, _ = ours.pop("paper", []), ours.pop("sizes", [])
     if len({content["made"]["processor"] for name, content in made.items() if name in ours}) > 1:
         del ours["defaults"]  # seconds of two processors are no line
     lengths = sorted((r for rows in ours.values() for r in rows), key=lambda r: r["processor_seconds"])

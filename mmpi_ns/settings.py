@@ -172,7 +172,7 @@ class MMPIModelConfig(ModelConfig):
     """Rays in a rendering chunk; 0 chooses for the device (on a GPU: as many as fit in half of its free memory)."""
     size: float = 1.0
     """Factor on training rays and maximum texels where they follow the capture (``mmpi``): 0.3 for a quick look, 4 for
-    a better one; more than four rays per training pixel are taken only by default, as images do not improve."""
+    a better one; more than two rays per training pixel are taken only by default, as images do not improve."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Placement and resolution of the MPIs."""
     plan_file: Path | None = None

@@ -15,7 +15,7 @@ FEW, MANY = 2.6e6, 10.4e6
 """Training pixels of a window below which steps decrease in proportion, and above which they increase."""
 MOST_TIMES = 3.0
 """Largest multiple of the steps."""
-GPU_MULTIPLE, RAYS_PER_PIXEL = 4.0, 4.0
+GPU_MULTIPLE, RAYS_PER_PIXEL = 4.0, 2.0
 """Factor on the rays of a run on a GPU; and rays per training pixel up to which a run may be longer than the default:
 beyond, images do not improve (docs/results/README.md, "Longer and shorter")."""
 RAYS_PER_PROCESSOR = 256

@@ -1,5 +1,7 @@
 """The order in which the pixels of an image are rendered."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -11,5 +13,5 @@ def test_every_pixel_has_one_place_and_squares_are_together(height, width):
     order = square_by_square(height, width, torch.device("cpu"))
     assert order.sort().values.tolist() == list(range(height * width))
     seen = [(n // width // SQUARE, n % width // SQUARE) for n in order.tolist()]
-    changes = [b for a, b in zip(seen, seen[1:], strict=False) if a != b]
+    changes = [b for a, b in pairwise(seen) if a != b]
     assert len(changes) + 1 == len(set(seen))  # no square is left and entered again
