@@ -18,26 +18,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from apart import environment_of
-from report import Bench, Row, commit, processor, read_json
+from report import Row, commit, processor, read_json
 from trainers import Scene, clock
 
 import mmpi_priors.ops
 from mmpi_ns.ops import build
 from mmpi_ns.utils.files import cache_folder
-
-
-@dataclass(kw_only=True)
-class SceneBench(Bench):
-    """Options of benchmarks on one scene."""
-
-    data: Path
-    """The scene (a folder with transforms.json)."""
-    downscale_factor: int = 4
-    """Image size to use."""
-
-    @property
-    def scene(self) -> Scene:
-        return Scene(self.data, self.downscale_factor)
 
 
 def median_s(work: Callable[[], Any], repeats: int) -> float:
