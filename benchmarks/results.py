@@ -227,8 +227,8 @@ def results_page(made: dict[str, Row]) -> str:
         "PSNR": "{psnr:.2f}{spread}",
         "SSIM": "{ssim:.3f}",
         "field alone": lambda r: f"{r['field_psnr']:.2f} / {r['field_ssim']:.3f}" if r["field_psnr"] else "the same",
-        "processor s": "{processor_seconds:.0f}",
-        "GiB": "{gib:.1f}",
+        "processor s": lambda r: f"{r['processor_seconds']:.0f}" if r["processor_seconds"] else "",
+        "GiB": lambda r: f"{r['gib']:.1f}" if r["gib"] else "",
     }
     blocks = []
     for name, content in made.items():
