@@ -21,7 +21,7 @@ from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import Capacity, MarchOptions
-from mmpi_ns.placement.defaults import steps_for
+from mmpi_ns.placement.defaults import steps_for, texels_times
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows, square_by_square
@@ -32,7 +32,7 @@ from mmpi_ns.sampler import march_options
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.settings import MMPIModelConfig, PlacementConfig
+from mmpi_ns.settings import MMPIModelConfig
 from mmpi_ns.training.checkpoints import last_checkpoint
 from mmpi_ns.training.losses import batch_losses, over_background
 from mmpi_ns.training.memory import check_memory, texel_bytes
@@ -57,8 +57,7 @@ class MMPIModel(Model):
         """Data of the training images; None where the plan comes from a checkpoint."""
         capture, device = self.capture, self.kwargs.get("device", "cpu")
         views = None if capture is None else capture.views
-        sized = replace(config.placement, max_texels=config.size * config.placement.max_texels)
-        windows = self._plan(sized)
+        windows = self._plan()
         # A single head always trains alone.
         joint = config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
         if capture is not None:
@@ -95,15 +94,18 @@ class MMPIModel(Model):
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, adjustments, scale_is_free)
         self.register_load_state_dict_post_hook(type(self)._take_plan)
 
-    def _plan(self, placement: PlacementConfig) -> WindowedPlan:
+    def _plan(self) -> WindowedPlan:
         """Scene plan of the option, or of the placement rule for the observations of the training cameras."""
-        config, capture = self.config, self.capture
+        config, placement, capture = self.config, self.config.placement, self.capture
         observations = None if capture is None else capture.observations
         given = None
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             given = WindowedPlan.load(config.plan_file)
+        size = config.size
         if observations is not None and config.total_steps == 0:
-            config.total_steps = steps_for(most_pixels(observations, placement, given), config.size, config.rays_times)
+            pixels = most_pixels(observations, placement, given)
+            config.total_steps = steps_for(pixels, size, config.rays_times)
+            size = texels_times(pixels, size, config.rays_times)
         if given is not None:
             return given
         if capture is None or observations is None:
@@ -111,7 +113,8 @@ class MMPIModel(Model):
             if folder is not None and folder.is_dir():
                 last_checkpoint(folder)  # nerfstudio looks for it only after making the model, and ends in a traceback
             return WindowedPlan.single(NO_PLAN)
-        return place_windows(observations, placement, config.total_steps * capture.rays_per_step)
+        sized = replace(placement, max_texels=size * placement.max_texels)
+        return place_windows(observations, sized, config.total_steps * capture.rays_per_step)
 
     def _new_field(self, views: TrainingViews | None = None) -> MMPIField:
         """A field with this run's settings, of the first window at the first resolution: to train, or to load into."""
@@ -216,10 +219,12 @@ class MMPIModel(Model):
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
         """Renders an image: window by window, in chunks of the configured size or of one that suits the device."""
         with torch_apart():
-            order = square_by_square(*camera_ray_bundle.shape, camera_ray_bundle.origins.device)
+            height, width = camera_ray_bundle.shape
+            order = square_by_square(height, width, camera_ray_bundle.origins.device)
             outputs = self.image_outputs(camera_ray_bundle.flatten()[order], self.chunk_size)
-            shape = (*camera_ray_bundle.shape, -1)
-            outputs = {k: torch.empty_like(v).index_copy_(0, order, v).view(shape) for k, v in outputs.items()}
+            outputs = {
+                k: torch.empty_like(v).index_copy_(0, order, v).view(height, width, -1) for k, v in outputs.items()
+            }
             if self.details is None or self.progress.windows.find(self.show.value) is not None:
                 return outputs
             nearest = self.config.rendering.nearest_images

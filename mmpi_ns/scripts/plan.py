@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_for
+from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_for, texels_times
 from mmpi_ns.scripts.command import run
 from mmpi_ns.settings import PlacementConfig
 from mmpi_ns.utils.errors import InputError, log, looked_at, quoted
@@ -57,8 +57,9 @@ class PlanCommand:
         windows = None if self.plan_file is None else WindowedPlan.load(self.plan_file)
         observations, manager = load_observations(self.scene, self.downscale_factor)
         if windows is None:
-            steps = steps_for(most_pixels(observations, self.placement), self.size)
-            sized = replace(self.placement, max_texels=self.size * self.placement.max_texels)
+            pixels = most_pixels(observations, self.placement)
+            texels = texels_times(pixels, self.size) * self.placement.max_texels
+            sized, steps = replace(self.placement, max_texels=texels), steps_for(pixels, self.size)
             windows = place_windows(observations, sized, steps * RAYS)
         draw_plan(self.output / "plan.png", windows, observations)
         text = explain(windows, observations)
