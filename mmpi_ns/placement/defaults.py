@@ -18,6 +18,8 @@ MOST_TIMES = 3.0
 GPU_MULTIPLE, RAYS_PER_PIXEL = 4.0, 2.0
 """Factor on the rays of a run on a GPU; and rays per training pixel up to which a run may be longer than the default:
 beyond, images do not improve (docs/results/README.md, "Longer and shorter")."""
+LEAST_TIMES = 1.5
+"""Least multiple of the default steps that this limit must allow; below it, a run is not made longer."""
 RAYS_PER_PROCESSOR = 256
 """Pixel rays of a step per multiprocessor of a GPU."""
 MOST_RAYS_TIMES = 4
@@ -44,12 +46,15 @@ def rays_times(processors: int) -> int:
 
 
 def steps_for(pixels: float, size: float = 1.0, times: int = 1) -> int:
-    """Training steps of a window, in hundreds, by its training pixels (``FEW``, ``MANY``), multiplied by ``size`` up to
-    ``RAYS_PER_PIXEL`` and divided by ``times``, the factor on the rays per step (``rays_times``). A GPU, whose
-    ``times`` are above 1, takes more rays (``GPU_MULTIPLE``)."""
+    """Training steps of a window, in hundreds, by its training pixels (``FEW``, ``MANY``).
+
+    They are multiplied by ``size`` up to ``RAYS_PER_PIXEL`` (see ``LEAST_TIMES``) and divided by ``times``, the factor
+    on the rays per step (``rays_times``). A GPU, whose ``times`` are above 1, takes more rays (``GPU_MULTIPLE``).
+    """
     steps = max(LEAST_STEPS, STEPS * min(pixels / FEW, max(1.0, pixels / MANY), MOST_TIMES))
     multiple = size * (GPU_MULTIPLE if times > 1 else 1.0)
-    steps = min(multiple * steps, max(steps, RAYS_PER_PIXEL * pixels / RAYS))
+    most = RAYS_PER_PIXEL * pixels / RAYS
+    steps = min(multiple * steps, most if most >= LEAST_TIMES * steps else steps)
     return 100 * max(1, round(steps / 100)) // times
 
 

@@ -55,9 +55,9 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     assert most_pixels(many, windows, WindowedPlan.single(NO_PLAN)) == many.sizes.prod(-1).sum()
     steps = [steps_for(pixels) for pixels in (1e4, 0.75 * FEW, FEW, MANY, 2 * MANY, 1e12)]
     assert steps == [2500, 3000, 4000, 4000, 8000, 12000]
-    asked = ((FEW, 0.3), (MANY, 4.0), (FEW, 4.0), (1e4, 4.0))  # the last two reach two rays a pixel
-    assert [steps_for(pixels, size) for pixels, size in asked] == [1200, 16000, 5100, 2500]
-    assert [texels_times(pixels, size) for pixels, size in asked] == [0.3, 4.0, 5100 / 4000, 1.0]
+    asked = ((FEW, 0.3), (MANY, 4.0), (2 * FEW, 4.0), (FEW, 4.0), (1e4, 4.0))  # the last three reach two rays a pixel
+    assert [steps_for(pixels, size) for pixels, size in asked] == [1200, 16000, 10200, 4000, 2500]
+    assert [texels_times(pixels, size) for pixels, size in asked] == [0.3, 4.0, 2.55, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,14 @@ def test_steps_follow_the_pixels_of_the_largest_window():
 def test_a_larger_gpu_draws_more_rays_a_step_and_in_all_up_to_two_a_pixel(processors, rays):
     times = rays_times(processors)
     assert times * RAYS == rays
-    for pixels, multiple in ((1.0, 1), (0.25 * FEW, 1), (0.6 * FEW, 3000 / 2500), (MANY, 4), (2.5 * MANY, 4)):
+    for pixels, multiple in (
+        (1.0, 1),
+        (0.25 * FEW, 1),
+        (0.6 * FEW, 1),
+        (2 * FEW, 10200 / 4000),
+        (MANY, 4),
+        (2.5 * MANY, 4),
+    ):
         expected = steps_for(pixels) * (multiple if times > 1 else 1)
         assert times * steps_for(pixels, times=times) == pytest.approx(expected, abs=times)
     whole, fewer = (make_schedule(ScheduleConfig(), 2000 // n) for n in (1, times))
