@@ -21,7 +21,7 @@ from mmpi_ns.data.rays import image_rays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import Capacity, MarchOptions
-from mmpi_ns.placement.defaults import steps_for, texels_times
+from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows, square_by_square
@@ -101,11 +101,8 @@ class MMPIModel(Model):
         given = None
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             given = WindowedPlan.load(config.plan_file)
-        size = config.size
         if observations is not None and config.total_steps == 0:
-            pixels = most_pixels(observations, placement, given)
-            config.total_steps = steps_for(pixels, size, config.rays_times)
-            size = texels_times(pixels, size, config.rays_times)
+            config.total_steps = steps_for(most_pixels(observations, placement, given), config.size, config.rays_times)
         if given is not None:
             return given
         if capture is None or observations is None:
@@ -113,7 +110,7 @@ class MMPIModel(Model):
             if folder is not None and folder.is_dir():
                 last_checkpoint(folder)  # nerfstudio looks for it only after making the model, and ends in a traceback
             return WindowedPlan.single(NO_PLAN)
-        sized = replace(placement, max_texels=size * placement.max_texels)
+        sized = replace(placement, max_texels=min(config.size, 1.0) * placement.max_texels)
         return place_windows(observations, sized, config.total_steps * capture.rays_per_step)
 
     def _new_field(self, views: TrainingViews | None = None) -> MMPIField:

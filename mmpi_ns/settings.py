@@ -171,9 +171,8 @@ class MMPIModelConfig(ModelConfig):
     eval_num_rays_per_chunk: int = 0
     """Rays in a rendering chunk; 0 chooses for the device (on a GPU: as many as fit in half of its free memory)."""
     size: float = 1.0
-    """Factor on training rays, and on the maximum of texels, where they follow the capture (``mmpi``): 0.3 for a quick
-    look, 4 for a better one. Rays are multiplied up to two per training pixel, and texels no more than rays: images do
-    not improve beyond."""
+    """Factor on training rays where they follow the capture (``mmpi``): 0.3 for a quick look, also with fewer texels; 4
+    for a better one. Rays are multiplied up to two per training pixel: images do not improve beyond."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Placement and resolution of the MPIs."""
     plan_file: Path | None = None

@@ -58,11 +58,6 @@ def steps_for(pixels: float, size: float = 1.0, times: int = 1) -> int:
     return 100 * max(1, round(steps / 100)) // times
 
 
-def texels_times(pixels: float, size: float, times: int = 1) -> float:
-    """Factor on the maximum of texels: ``size``, and no more than that on the steps, as rays pay for texels."""
-    return min(size, steps_for(pixels, size, times) / steps_for(pixels, 1.0, times))
-
-
 def check_placement(config: PlacementConfig, prefix: str) -> None:
     """Raises InputError naming the option, with its prefix on the command line, whose value cannot be used."""
     check_options(config, RANGES, prefix)

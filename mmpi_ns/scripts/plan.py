@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_for, texels_times
+from mmpi_ns.placement.defaults import PLACEMENT, RAYS, check_placement, steps_for
 from mmpi_ns.scripts.command import run
 from mmpi_ns.settings import PlacementConfig
 from mmpi_ns.utils.errors import InputError, log, looked_at, quoted
@@ -37,7 +37,7 @@ class PlanCommand:
     plan_file: Path | None = None
     """Evaluate this plan instead of making a new one."""
     size: float = 1.0
-    """Multiple of texels and steps, as ``--pipeline.model.size`` of ns-train."""
+    """As ``--pipeline.model.size`` of ns-train."""
     placement: PlacementConfig = field(default_factory=lambda: PLACEMENT)
     """The rule's settings."""
 
@@ -57,9 +57,8 @@ class PlanCommand:
         windows = None if self.plan_file is None else WindowedPlan.load(self.plan_file)
         observations, manager = load_observations(self.scene, self.downscale_factor)
         if windows is None:
-            pixels = most_pixels(observations, self.placement)
-            texels = texels_times(pixels, self.size) * self.placement.max_texels
-            sized, steps = replace(self.placement, max_texels=texels), steps_for(pixels, self.size)
+            steps = steps_for(most_pixels(observations, self.placement), self.size)
+            sized = replace(self.placement, max_texels=min(self.size, 1.0) * self.placement.max_texels)
             windows = place_windows(observations, sized, steps * RAYS)
         draw_plan(self.output / "plan.png", windows, observations)
         text = explain(windows, observations)

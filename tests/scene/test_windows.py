@@ -12,7 +12,7 @@ import torch
 from hand_made import make_mpi, observed
 from training_runs import datamanager, schedule_of
 
-from mmpi_ns.placement.defaults import FEW, MANY, RAYS, rays_times, steps_for, texels_times
+from mmpi_ns.placement.defaults import FEW, MANY, RAYS, rays_times, steps_for
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.split import cameras_of, find_balls, most_pixels, of_cameras, place_windows
 from mmpi_ns.scene.plan import NO_PLAN, ScenePlan
@@ -57,7 +57,6 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     assert steps == [2500, 3000, 4000, 4000, 8000, 12000]
     asked = ((FEW, 0.3), (MANY, 4.0), (2 * FEW, 4.0), (FEW, 4.0), (1e4, 4.0))  # the last three reach two rays a pixel
     assert [steps_for(pixels, size) for pixels, size in asked] == [1200, 16000, 10200, 4000, 2500]
-    assert [texels_times(pixels, size) for pixels, size in asked] == [0.3, 4.0, 2.55, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(
