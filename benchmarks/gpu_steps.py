@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 from torch.profiler import ProfilerActivity, profile
-from trainers import Scene, Steps, clock, train_words
+from trainers import BARE, Scene, Steps, clock, train_words
 
 NODES = (1, 100, 700)
 """Of graphs whose replay is timed."""
@@ -118,7 +118,7 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         scene, start = Scene(given.data, given.downscale_factor), clock()
-        steps = Steps(train_words(given.what, (), scene, Path(folder), given.steps, 0, device))
+        steps = Steps(train_words(given.what, BARE, scene, Path(folder), given.steps, 0, device))
         note("set up, s", clock() - start)
         for stage in (*given.stages, given.steps):
             if stage > steps.step:
