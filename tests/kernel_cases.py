@@ -158,10 +158,46 @@ def _votes(device: str, shapes: Shapes) -> list[tuple]:
     return cases
 
 
+def _rays_of_samples(device: str) -> tuple[Tensor, Tensor]:
+    """Optical depths of samples, a tenth of them opaque, and the first of each ray; some rays are without, and three
+    samples belong to none."""
+    starts = torch.nn.functional.pad((torch.arange(RAYS, device=device) % 7).cumsum(0), (1, 0))
+    tau = _random(device, int(starts[-1]) + 3)
+    return torch.where(tau > 0.9, 500 * tau, tau), starts
+
+
+def _composites(device: str, shapes: Shapes) -> list[tuple]:
+    tau, starts = _rays_of_samples(device)
+    before, total = 0.1 * _random(device, len(tau)), 0.3 * _random(device, RAYS, 1)
+    return [(tau.requires_grad_(), starts, before, total)]
+
+
+def _depths(device: str, shapes: Shapes) -> list[tuple]:
+    """Inverse distances that fall along rays, a third of which have no target."""
+    tau, starts = _rays_of_samples(device)
+    inverse_t = torch.linspace(1, 0, len(tau), device=device)
+    targets = _random(device, RAYS, 2) * (torch.arange(RAYS, device=device) % 3 > 0)[:, None] + 1e-3
+    weights = (0.1 * _random(device, len(tau))).index_fill(0, torch.arange(int(starts[-1]), len(tau), device=device), 0)
+    return [(weights.requires_grad_(), inverse_t, starts, 0.1 * _random(device, RAYS), targets, 1.3)]
+
+
+def _lookups(device: str, shapes: Shapes) -> list[tuple]:
+    """Samples of every head, some beyond its borders."""
+    cases = []
+    for mpis in shapes.mpis:
+        layout = _scene(device, shapes.cube, mpis)[0]
+        number = torch.arange(8 * RAYS, device=device)
+        cases.append((layout, number % layout.num_heads, number % 6, 2.4 * _random(device, len(number), 3) - 1.2))
+    return cases
+
+
 CHANGED = {"adam_rows": (0, 1)}
 """Arguments that an operation changes."""
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "adam_rows": _updates,
+    "composite_weights": _composites,
+    "depth_sums": _depths,
+    "texel_rows": _lookups,
     "find_votes": _votes,
     "march": _marches,
     "total_variation": _variations,

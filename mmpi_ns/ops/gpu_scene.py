@@ -86,6 +86,15 @@ def texel_of(grids, row, mask, NUM_HEADS: tl.constexpr):
 
 
 @triton.jit
+def samples_of(starts, num_rays, BLOCK: tl.constexpr):
+    """Rays of a program, whether they exist, and the first and the number of their samples."""
+    ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = ray < num_rays
+    start = tl.load(starts + ray, inside, 0)
+    return ray, inside, start, tl.load(starts + ray + 1, inside, 0) - start
+
+
+@triton.jit
 def vectors(of_rays, ray):
     """Vectors of rays, an array for each axis."""
     at = of_rays + 3 * ray

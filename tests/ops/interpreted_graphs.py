@@ -110,7 +110,7 @@ class TapeRecorder:
 
 
 STEPS = 16
-MOST = {"joint": 570, "individual": 710, "blend": 700, "finetune": 810}
+MOST = {"joint": 345, "individual": 495, "blend": 485, "finetune": 600}
 """Launches of a step in each phase, of two MPIs and a cube."""
 
 

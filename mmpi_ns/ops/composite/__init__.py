@@ -62,7 +62,7 @@ class Composite:
     """Behind the last sample."""
 
 
-@operation()
+@operation("gpu")
 def composite_weights(
     tau: Float[Tensor, "N"],
     starts: Int[Tensor, "R+1"],

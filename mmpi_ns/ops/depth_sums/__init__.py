@@ -28,7 +28,7 @@ class DepthSums(NamedTuple):
     """Whether the ray has a target and a sample within three widths of it."""
 
 
-@operation()
+@operation("gpu")
 def depth_sums(
     weights: Float[Tensor, "N"],
     inverse_t: Float[Tensor, "N"],

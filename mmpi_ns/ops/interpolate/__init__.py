@@ -64,7 +64,7 @@ class Table(nn.Parameter):
         self.grad_rows, self._row_grad = rows, values
 
 
-@operation()
+@operation("gpu")
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N B"], Float[Tensor, "N B"]]:

@@ -19,7 +19,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from mmpi_ns.ops import ends
-from mmpi_ns.ops.composite import ray_numbers
 from mmpi_ns.ops.gather.gpu import activate, sizes
 from mmpi_ns.ops.gpu_scene import (
     DEPTH,
@@ -40,8 +39,8 @@ from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
 HALF = tl.constexpr(ends.HALF)
-STEPS = 8
-"""Samples of a ray per chunk of lookups."""
+STEPS, PACKED = 8, 32
+"""Samples of a ray per chunk of lookups, and of those that are packed."""
 RAYS = 4
 """Rays per program (one warp). Four times as many are no faster, and take minutes to compile."""
 RANGES = 256
@@ -250,20 +249,44 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
     return m
 
 
+@triton.jit(do_not_specialize=("num_rays", "room", "count"))
+def pack_kernel(
+    kept, starts, from_heads, from_planes, from_ndc, from_inverse_ts, from_taus, from_skipped,
+    heads, planes, ndc, inverse_ts, taus, skipped, num_rays, room, count, RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    """Moves samples from the slots of their rays to one array."""
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    inside = ray < num_rays
+    number, start = tl.load(kept + ray, inside, 0)[:, None], tl.load(starts + ray, inside, 0)[:, None]
+    for first in range(0, tl.max(number), STEPS):
+        step = first + tl.arange(0, STEPS)[None, :]
+        slot, to = ray[:, None].to(tl.int64) * room + step, start + step
+        has = (step < number) & (to < count)
+        tl.store(heads + to, tl.load(from_heads + slot, has, 0).to(tl.int64), has)
+        tl.store(planes + to, tl.load(from_planes + slot, has, 0).to(tl.int64), has)
+        tl.store(inverse_ts + to, tl.load(from_inverse_ts + slot, has, 0.0), has)
+        tl.store(taus + to, tl.load(from_taus + slot, has, 0.0), has)
+        tl.store(skipped + to, tl.load(from_skipped + slot, has, 0.0), has)
+        for axis in tl.static_range(3):
+            tl.store(ndc + 3 * to + axis, tl.load(from_ndc + 3 * slot + axis, has, 0.0), has)
+
+
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """``sampler.march`` on a GPU, which synchronises once, to size the result, unless a capacity is given."""
     m, capacity = march_into_slots(layout, tables, rays, options), options.capacity
     of_heads = tuple(m.numbers.tolist()) if capacity is None else capacity.heads
     count = sum(of_heads) if capacity is None else capacity.samples
-    starts = pad(m.kept.cumsum(0), (1, 0)).clamp(max=count)
-    owner, room = ray_numbers(starts, count), m.samples[0].shape[1]
-    behind, slots = owner == len(m.kept), owner * room + torch.arange(count, device=starts.device) - starts[owner]
-    slots = slots.clamp(max=len(m.kept) * room - 1)
-    flat = (x.flatten(0, 1)[slots] for x in m.samples)
-    heads, planes, *others = (x.masked_fill_(behind.view(-1, *[1] * (x.ndim - 1)), 0) for x in flat)
+    starts, device, room = pad(m.kept.cumsum(0), (1, 0)).clamp(max=count), m.kept.device, m.samples[0].shape[1]
+    indices, values = torch.zeros(2, count, dtype=torch.int64, device=device), torch.zeros(6, count, device=device)
+    flat = (*indices, values[:3].view(count, 3), *values[3:])
+    block = block_size(RAYS, device)
+    launch(
+        pack_kernel, len(m.kept) if count else 0, block, m.kept, starts, *m.samples, *flat, len(m.kept), room, count,
+        RAYS=block, STEPS=PACKED, num_warps=4,
+    )  # fmt: skip
     numbers = torch.cat([m.numbers.sum(0, keepdim=True), m.numbers])
     of_rays = (m.skipped_total, m.dropped_mass, m.num_intersected, m.fully_covered, of_heads)
-    return MergedSamples(heads.long(), planes.long(), *others, starts, *of_rays, capacity, numbers)
+    return MergedSamples(*flat, starts, *of_rays, capacity, numbers)
 
 
 def render_fused(
