@@ -19,6 +19,7 @@ from mmpi_ns.ops.march import MarchOptions, Rays
 from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 from mmpi_ns.scene.texels import BRICK, make_grids
+from mmpi_ns.training import losses as losses
 
 CLOSE = 1e-3
 """Largest difference relative to the largest number: a wrong kernel is off by more, another order of sums by less."""
@@ -143,7 +144,8 @@ def _updates(device: str, shapes: Shapes) -> list[tuple]:
         table, grad = _random(device, BRICK + 2 * ROWS, channels), _random(device, ROWS, channels) - 0.5
         moments = _random(device, len(table), 2, channels).bfloat16()
         cases.append((table, moments, rows, grad, AdamConstants(0.9, 0.99, 0.3, 1e-8, 0.1)))
-    return cases
+    network, grad = _random(device, 2, ROWS), (_random(device, 2, ROWS, 1)[..., 0] - 0.5).clamp(min=0)
+    return [*cases, (network, _random(device, 2, 2, ROWS), None, grad, cases[0][-1])]
 
 
 def _votes(device: str, shapes: Shapes) -> list[tuple]:
@@ -181,6 +183,26 @@ def _depths(device: str, shapes: Shapes) -> list[tuple]:
     return [(weights.requires_grad_(), inverse_t, starts, 0.1 * _random(device, RAYS), targets, 1.3)]
 
 
+def _losses(device: str, shapes: Shapes) -> list[tuple]:
+    """Two MPIs' pixel rays and keypoint rays, colours with alpha and exposures that clip; pixel rays alone."""
+    cases = []
+    for asked, times, channels in ((RAYS // 4, 2, 4), (RAYS, 1, 3)):
+        values = [_random(device, RAYS, n).squeeze(-1) for n in (3, 2, 2, 4, 5, 1, 1)]
+        transmittance = values[1][:, :1].masked_fill(values[1][:, 1:] < 0.2, 0.0)
+        given = [values[0], transmittance, values[2][:, :1], values[3][:, :3], values[4][:, :3], values[5], values[6]]
+        leaves = [x.contiguous().requires_grad_(i != 2) for i, x in enumerate(given)]
+        flags = values[5] > 0.3, values[6][:, None] > 0.5, 2 * _random(device, RAYS, 3) if channels == 4 else None
+        pixels = _random(device, asked, channels), _random(device, asked * times, 3)
+        cases.append((*leaves, *flags, *pixels, times, (0.3, 0.2, 0.1, 0.4, 0.7), 0.5, True))
+    return cases
+
+
+def _targets(device: str, shapes: Shapes) -> list[tuple]:
+    depths, counts = _random(device, RAYS, 2), torch.arange(RAYS, device=device)
+    keypoints = _random(device, RAYS, 1) * (counts % 2)[:, None]
+    return [(depths, keypoints, counts, 0.1), (None, keypoints, counts, 0.1), (depths, None, counts, 0.1)]
+
+
 def _lookups(device: str, shapes: Shapes) -> list[tuple]:
     """Samples of every head, some beyond its borders."""
     cases = []
@@ -197,6 +219,8 @@ CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "adam_rows": _updates,
     "composite_weights": _composites,
     "depth_sums": _depths,
+    "depth_targets": _targets,
+    "ray_losses": _losses,
     "texel_rows": _lookups,
     "find_votes": _votes,
     "march": _marches,

@@ -17,6 +17,7 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mmpi_ns.data.checks import check_transforms
 from mmpi_ns.data.copies import fit_cameras
@@ -24,16 +25,17 @@ from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.priors import Gains, Priors, PriorsConfig
 from mmpi_ns.data.ray_sources import PixelPool, RaySources, rays_to_keypoints
 from mmpi_ns.data.rays import CameraRays, TrainingRays
+from mmpi_ns.ops.dispatch import on_gpu
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, log
-from mmpi_ns.utils.random_draws import Generators, generator
+from mmpi_ns.utils.random_draws import generator
 
 Batch = tuple[TrainingRays, dict[str, Any]]
 CAPTURE = "capture"
 """Key of the ``Capture`` in the data set's metadata, by which nerfstudio hands it to the model."""
 AT_ONCE = 8
-"""Steps whose rays are drawn together on a CPU."""
+"""Steps whose rays are drawn together."""
 MANY_DEPTHS = 0.4
 """Minimum share of the training pixels with a depth prior for training to start from surfaces: two thirds have one in
 most captures, a fifth if images hardly overlap."""
@@ -92,9 +94,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """Share of the pixel rays in the current steps, with new views in proportion."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
-        self.draws = Generators(config.seed, kwargs.get("device", "cpu"))
         self._drawn: tuple[RaySources, tuple[int, int], Batch] | None = None
-        """Rays of some steps with their sources, number of the steps and number of rays."""
+        """Rays of some steps with their sources, number of rays and number of the steps."""
+        self._place, self._place_on_gpu = 0, torch.zeros(1, dtype=torch.int64, device=kwargs.get("device", "cpu"))
+        """Place of the step among them; that on a GPU is read by recorded steps."""
         parser: Any = config.dataparser
         factor = getattr(parser, "downscale_factor", None)
         if isinstance(factor, float) and factor.is_integer():  # ns-render dataset gives 2.0
@@ -227,27 +230,50 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(**loaders)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``. On a CPU, rays of ``AT_ONCE`` steps are
-        drawn together: drawing is a hundred small operations, and their number is its cost.
+        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``.
 
         Outside training (ns-export always requests step 0) only pixel rays, different ones in each call.
         """
         self.train_count += 1
-        if self.sources is None:  # no window was chosen
-            self.use_cameras(None)
-        sources, place = self.sources, 0
-        pixel_rays = max(1, round(self.share_of_rays * self.get_train_rays_per_batch()))
-        assert sources is not None
         if not self.training:
             g = generator(self.config.seed, self.train_count, "pixels", self.device)
-            rays, batch = sources.draw(pixel_rays, g, pixels_alone=True)
-        elif torch.device(self.device).type == "cpu" and not self.draws.recording:
-            number, place = divmod(step, AT_ONCE)
-            if self._drawn is None or self._drawn[0] is not sources or self._drawn[1] != (number, pixel_rays):
-                steps = range(number * AT_ONCE, (number + 1) * AT_ONCE)
-                drawn = sources.draw(pixel_rays, *(generator(self.config.seed, i, "pixels") for i in steps))
-                self._drawn = sources, (number, pixel_rays), drawn
-            rays, batch = self._drawn[2]
-        else:
-            rays, batch = sources.draw(pixel_rays, self.draws.of(step, "pixels"))
-        return rays[place], {name: values[place] for name, values in batch.items()}
+            rays, batch = self._current().draw(self._pixel_rays, g, pixels_alone=True)
+            return rays[0], {name: values[0] for name, values in batch.items()}
+        self.draw_rays(step)
+        assert self._drawn is not None
+        rays, batch = self._drawn[2]
+        if not on_gpu(rays.origins):
+            return rays[self._place], {name: values[self._place] for name, values in batch.items()}
+        place = self._place_on_gpu
+        return rays[place][0], {name: values[place][0] for name, values in batch.items()}
+
+    def draw_rays(self, step: int) -> None:
+        """Draws the rays of ``AT_ONCE`` steps together, unless they are there: drawing is a hundred small operations,
+        and their number is its cost. On a GPU those of the next steps take the same memory, for recorded steps."""
+        sources, (number, place), pixel_rays = self._current(), divmod(step, AT_ONCE), self._pixel_rays
+        held = self._drawn if self._drawn is not None and self._drawn[0] is sources else None
+        if held is None or held[1] != (pixel_rays, number):
+            steps = range(number * AT_ONCE, (number + 1) * AT_ONCE)
+            drawn = sources.draw(pixel_rays, *(generator(self.config.seed, i, "pixels", self.device) for i in steps))
+            if on_gpu(drawn[0].origins) and held is not None and held[1][0] == pixel_rays:
+                for old, new in zip(_tensors(held[2]), _tensors(drawn), strict=True):
+                    old.copy_(new)
+                drawn = held[2]
+            self._drawn = sources, (pixel_rays, number), drawn
+        if on_gpu(self._place_on_gpu) and place != self._place:
+            self._place_on_gpu.fill_(place)
+        self._place = place
+
+    def _current(self) -> RaySources:
+        if self.sources is None:  # no window was chosen
+            self.use_cameras(None)
+        assert self.sources is not None
+        return self.sources
+
+    @property
+    def _pixel_rays(self) -> int:
+        return max(1, round(self.share_of_rays * self.get_train_rays_per_batch()))
+
+
+def _tensors(batch: Batch) -> list[Tensor]:
+    return [x for x in (*vars(batch[0]).values(), *batch[1].values()) if isinstance(x, Tensor)]

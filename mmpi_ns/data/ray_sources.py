@@ -224,6 +224,6 @@ class RaySources:
             keypoint_disparities=keypoints,
             disparities=depths,
             exposures=None if self.exposures is None else self.exposures[columns["camera_indices"][..., 0]],
-            through_pixel=(torch.arange(keypoints.shape[1], device=device) < pixel_rays)[:, None].expand(steps, -1, 1),
+            through_pixel=(torch.arange(keypoints.shape[1], device=device) < pixel_rays)[:, None].repeat(steps, 1, 1),
         )
         return rays, {"image": joined(images), "indices": indices.view(steps, -1, 3)}

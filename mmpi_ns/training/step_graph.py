@@ -1,4 +1,4 @@
-"""A training step on a GPU as two CUDA graphs: draws, rendering and gradients in one, the optimiser in the other.
+"""A training step on a GPU as two CUDA graphs: rendering and gradients in one, the optimiser in the other.
 
 A step launches some hundreds of small kernels, and the host needs longer to launch them than the GPU to run them. A
 graph launches them at once. It replays a step on the same memory, so all sizes are fixed (``Capacity``), there is no
@@ -10,7 +10,6 @@ the capacity changes nothing. The host reads this some steps later and records a
 
 from __future__ import annotations
 
-import functools
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -100,7 +99,7 @@ class StepGraphs:
     def __init__(self, model: Any, manager: MMPIDataManager, optimizers: dict[str, Any], recorder: Any = None) -> None:
         self.model, self.manager, self.optimizers = model, manager, optimizers
         self.new_recorder = recorder or Recorder
-        self.generators: tuple[Generators, ...] = (manager.draws, model.draws)
+        self.draws: Generators = model.draws
         self.is_off = False
         """Recording has failed: steps run one operation at a time."""
         self.repeated = self.lost = 0
@@ -126,6 +125,7 @@ class StepGraphs:
     def step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         """Trains one step; losses and metrics as ``Trainer.train_iteration`` returns them."""
         kind = self._kind(step)
+        self.manager.draw_rays(step)
         self._hear(wait=False)
         if self.is_off or self._measured < MEASURED:
             return self._measured_step(step)
@@ -168,15 +168,14 @@ class StepGraphs:
     def _start(self, step: int) -> None:
         """Sets the inputs of recorded steps."""
         self.model.decay.fill_(self.model.progress.schedule.decay(step))
-        for generators in self.generators:
-            generators.start(step)
+        self.draws.start(step)
 
     def _zero_grad(self) -> None:
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
 
     def _find_gradients(self, step: int, capacity: Capacity | None) -> Results:
-        """Draws rays, renders them and computes gradients of the losses; changes only the records of use."""
+        """Renders the rays of a step and computes gradients of the losses; changes only the records of use."""
         model, results = self.model, Results()
         model.capacity = capacity
         try:
@@ -186,7 +185,7 @@ class StepGraphs:
             losses = model.get_loss_dict(outputs, batch, metrics)
         finally:
             model.capacity = None
-        total = functools.reduce(torch.add, losses.values())
+        total = torch.stack([*losses.values()]).sum()
         rays = outputs["training"]
         if capacity is not None:
             numbers, distinct = rays.samples.numbers, rays.lookup.distinct
@@ -257,13 +256,11 @@ class StepGraphs:
 
     @contextmanager
     def _recording(self):
-        for generators in self.generators:
-            generators.recording = True
+        self.draws.recording = True
         try:
             yield
         finally:
-            for generators in self.generators:
-                generators.recording = False
+            self.draws.recording = False
 
     def _record(self, step: int, kind: Any) -> Recorded | None:
         """Records a kind of step and runs its first half; None if the replay differs."""
@@ -283,7 +280,7 @@ class StepGraphs:
         self._zero_grad()
         if self._recorder is None:
             self._recorder = self.new_recorder()
-        streams = [g for generators in self.generators for g in generators.held.values()]
+        streams = [*self.draws.held.values()]
         held: list[Results] = []
         with self._recording():
             gradients = self._recorder.record(lambda: held.append(self._find_gradients(step, capacity)), streams)
@@ -318,6 +315,5 @@ class StepGraphs:
         self.is_off = True
         self._forget()
         self._zero_grad()
-        for generators in self.generators:
-            generators.held.clear()
+        self.draws.held.clear()
         log(f"Steps run one operation at a time, several times slower: {reason}.", "yellow")

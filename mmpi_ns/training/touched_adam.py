@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from mmpi_ns.ops.adam import AdamConstants, adam, adam_rows
+from mmpi_ns.ops.adam import AdamConstants, adam_rows
 from mmpi_ns.ops.dispatch import on_gpu
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.scene.bricks import move_bricks
@@ -75,13 +75,8 @@ class TouchedAdam(torch.optim.Optimizer):
             for param in group["params"]:
                 if param.grad is None:
                     continue
-                old, constants = (param.data, self.state[param]["moments"]), self._constants[param]
-                if isinstance(param, Table):
-                    assert param.grad_rows is not None
-                    adam_rows(*old, param.grad_rows, param.grad, constants)
-                else:
-                    for tensor, new in zip(old, adam(*old, param.grad, constants), strict=True):
-                        tensor.copy_(new)
+                rows = param.grad_rows if isinstance(param, Table) else None
+                adam_rows(param.data, self.state[param]["moments"], rows, param.grad, self._constants[param])
 
     def keep_bricks(self, param: Parameter, kept: Tensor) -> None:
         """Keeps the moments of the bricks ``kept`` [K] of a table, in ascending order."""

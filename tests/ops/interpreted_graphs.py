@@ -110,7 +110,7 @@ class TapeRecorder:
 
 
 STEPS = 16
-MOST = {"joint": 345, "individual": 495, "blend": 485, "finetune": 600}
+MOST = {"joint": 300, "individual": 450, "blend": 440, "finetune": 550}
 """Launches of a step in each phase, of two MPIs and a cube."""
 
 

@@ -1,4 +1,4 @@
-"""Adam on the rows of a table that a batch touched: DVGO's masked Adam, in place."""
+"""Adam on the rows of a table that a batch touched, or on all of a tensor: DVGO's masked Adam, in place."""
 
 from __future__ import annotations
 
@@ -31,21 +31,25 @@ class AdamConstants(NamedTuple):
 
 @operation("gpu")
 def adam_rows(
-    param: Float[Tensor, "T C"],
-    moments: Float[Tensor, "T 2 C"],
-    rows: Int[Tensor, "U"],
-    grad: Float[Tensor, "U C"],
+    param: Float[Tensor, "T *C"],
+    moments: Float[Tensor, "T 2 *C"],
+    rows: Int[Tensor, "U"] | None,
+    grad: Float[Tensor, "U *C"],
     constants: AdamConstants,
 ) -> None:
-    """One step of Adam on distinct rows. The empty brick and entries whose gradient is exactly 0 do not change.
+    """One step of Adam on distinct rows. A table's empty brick and entries whose gradient is exactly 0 do not change.
 
     Args:
         param: the table.
         moments: mean and uncentred variance of the gradients, in bfloat16 or in the table's precision.
-        rows: of the gradient (``Table.grad_rows``).
+        rows: of the gradient (``Table.grad_rows``); None for those of all of a tensor that is no table.
         grad: of those rows.
         constants: of the step.
     """
+    if rows is None:
+        for tensor, new in zip((param, moments), adam(param, moments, grad, constants), strict=True):
+            tensor.copy_(new)
+        return
     grad = grad.masked_fill((rows < BRICK)[:, None], 0)
     new_param, new_moments = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)
     param.index_copy_(0, rows, new_param)
@@ -68,8 +72,10 @@ def adam(
 
 
 @adam_rows.on_cpu
-def adam_rows_on_cpu(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: AdamConstants) -> None:
-    if not param.is_contiguous() or moments.dtype != torch.bfloat16:
+def adam_rows_on_cpu(
+    param: Tensor, moments: Tensor, rows: Tensor | None, grad: Tensor, constants: AdamConstants
+) -> None:
+    if rows is None or not param.is_contiguous() or moments.dtype != torch.bfloat16:
         adam_rows.reference(param, moments, rows, grad, constants)
         return
     step = (rows.contiguous(), param.shape[1], grad.contiguous(), param, moments, *map(float, constants))
