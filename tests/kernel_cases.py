@@ -203,6 +203,19 @@ def _targets(device: str, shapes: Shapes) -> list[tuple]:
     return [(depths, keypoints, counts, 0.1), (None, keypoints, counts, 0.1), (depths, None, counts, 0.1)]
 
 
+def _shader_inputs(device: str, shapes: Shapes) -> list[tuple]:
+    """Rays with more and with almost no weight."""
+    mass = _random(device, RAYS, 1) * (_random(device, RAYS, 2)[:, :1] > 0.3) + 1e-7
+    directions = torch.nn.functional.normalize(_random(device, RAYS, 3) - 0.5, dim=-1)
+    gathered = mass * _random(device, RAYS, shapes.channels)
+    return [(gathered.requires_grad_(), mass.clone().requires_grad_(), directions, octaves) for octaves in (2, 0)]
+
+
+def _shaded(device: str, shapes: Shapes) -> list[tuple]:
+    values = _random(device, RAYS, shapes.channels + 15), 4 * _random(device, RAYS, 3) - 2, _random(device, RAYS, 1)
+    return [tuple(x.requires_grad_() for x in values)]
+
+
 def _lookups(device: str, shapes: Shapes) -> list[tuple]:
     """Samples of every head, some beyond its borders."""
     cases = []
@@ -221,6 +234,8 @@ CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "depth_sums": _depths,
     "depth_targets": _targets,
     "ray_losses": _losses,
+    "shader_inputs": _shader_inputs,
+    "shaded": _shaded,
     "texel_rows": _lookups,
     "find_votes": _votes,
     "march": _marches,

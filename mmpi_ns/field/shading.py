@@ -13,14 +13,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mmpi_ns.field.tables import replace_data
+from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.gather import COLORS
-
-CHANGE = 4.0
-"""Change of the log odds of a colour for each unit of network output: a middle grey then changes by one unit."""
-MOST_CHANGE = 8.0
-"""Maximum of that change."""
-LEAST_MASS = 1e-6
-"""Rays with less accumulated weight are almost invisible, whatever their colour."""
+from mmpi_ns.ops.shading import CHANGE, LEAST_MASS, MOST_CHANGE
 
 
 class Networks(nn.Module):
@@ -116,10 +111,24 @@ class RayShader(Networks):
             accumulation: of the rays, including the dropped samples.
             directions: unit, world axes.
         """
-        mean = gathered / mass.clamp(min=LEAST_MASS)
-        encoded = positional_encoding(directions, self.frequencies[0])
-        offset = self.run(0, torch.cat([mean, encoded], -1))
-        return accumulation * change_odds(mean[:, :COLORS], offset)
+        inputs = shader_inputs(gathered, mass, directions, self.frequencies[0])
+        return shaded(inputs, self.run(0, inputs), accumulation)
+
+
+@operation("gpu", kernels="mmpi_ns.ops.shading")
+def shader_inputs(
+    gathered: Float[Tensor, "R C"], mass: Float[Tensor, "R 1"], directions: Float[Tensor, "R 3"], frequencies: int
+) -> Float[Tensor, "R I"]:
+    """Mean colours and features of rays, and their encoded directions."""
+    return torch.cat([gathered / mass.clamp(min=LEAST_MASS), positional_encoding(directions, frequencies)], -1)
+
+
+@operation("gpu", kernels="mmpi_ns.ops.shading")
+def shaded(
+    inputs: Float[Tensor, "R I"], offset: Float[Tensor, "R 3"], accumulation: Float[Tensor, "R 1"]
+) -> Float[Tensor, "R 3"]:
+    """Colours of rays from their mean ones, the first inputs, and the network's output."""
+    return accumulation * change_odds(inputs[:, :COLORS], offset)
 
 
 def change_odds(color: Float[Tensor, "R 3"], offset: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
