@@ -21,6 +21,7 @@ from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.votes import Votes, find_votes_on_cpu
 
 
+@operation("gpu", kernels="mmpi_ns.ops.votes")
 def blend_shares(
     reliability: Float[Tensor, "N H"], covers: Bool[Tensor, "N H"], heads: Int[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
@@ -58,6 +59,7 @@ def blend_shares(
     return log_share, log_rest
 
 
+@operation("gpu", kernels="mmpi_ns.ops.votes")
 def blended_optical_depth(
     tau: Float[Tensor, "N"], log_share: Float[Tensor, "N"], log_rest: Float[Tensor, "N"]
 ) -> Float[Tensor, "N"]:

@@ -47,9 +47,12 @@ def differences(name: str, device: str, shapes: Shapes = SMALL) -> list[float]:
         with dispatch.chosen("torch"):
             reference = _outcome(name, "reference", arguments)
         for a, b in zip(kernel, reference, strict=True):
-            assert a.shape == b.shape, name
-            if b.numel():
-                actual.append(float((a.double() - b.double()).abs().max() / b.double().abs().max().clamp(min=1e-6)))
+            finite = b.double().isfinite()
+            assert a.shape == b.shape and torch.equal(a[~finite], b[~finite]), name
+            if finite.any():
+                a, b = a[finite].double(), b[finite].double()
+                actual.append(float((a - b).abs().max() / b.abs().max().clamp(min=1e-6)))
+                assert actual[-1] >= 0, f"{name}: not a number"
     return actual
 
 
@@ -216,6 +219,24 @@ def _shaded(device: str, shapes: Shapes) -> list[tuple]:
     return [tuple(x.requires_grad_() for x in values)]
 
 
+def _shares(device: str, shapes: Shapes) -> list[tuple]:
+    """Heads that alone cover a sample, and reliabilities of all sizes."""
+    cases = []
+    for heads in shapes.mpis:
+        own = torch.arange(8 * RAYS, device=device) % heads
+        covers = (_random(device, 8 * RAYS, heads) > 0.6) | (torch.arange(heads, device=device) == own[:, None])
+        cases.append(((9 * _random(device, 8 * RAYS, heads) - 3).requires_grad_(), covers, own))
+    return cases
+
+
+def _depths_to_blend(device: str, shapes: Shapes) -> list[tuple]:
+    """Thin and opaque samples, of small and of large shares, and of sole heads."""
+    share, tau = 0.98 * _random(device, 8 * RAYS) + 0.01, 4 * _random(device, 8 * RAYS, 1)[:, 0] ** 3
+    sole = torch.arange(8 * RAYS, device=device) % 5 == 0
+    log_share, log_rest = share.log().masked_fill(sole, 0), (1 - share).log().masked_fill(sole, -torch.inf)
+    return [(tau.requires_grad_(), log_share.requires_grad_(), log_rest.requires_grad_())]
+
+
 def _lookups(device: str, shapes: Shapes) -> list[tuple]:
     """Samples of every head, some beyond its borders."""
     cases = []
@@ -230,6 +251,8 @@ CHANGED = {"adam_rows": (0, 1)}
 """Arguments that an operation changes."""
 CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "adam_rows": _updates,
+    "blend_shares": _shares,
+    "blended_optical_depth": _depths_to_blend,
     "composite_weights": _composites,
     "depth_sums": _depths,
     "depth_targets": _targets,

@@ -345,9 +345,20 @@ def _count_vote(vote_of_head, highest, others, grids, reliability, touched, k, h
 
 
 @triton.jit
+def blend(tau, log_share, log_rest, sole):
+    """Optical depths after blending (``blending.blended_optical_depth``), and alphas times shares."""
+    alpha, lower = one_minus_exp(tau) * tl.exp(log_share), log_share - tau
+    opaque = tl.maximum(log_rest, lower) + softplus(-tl.abs(log_rest - lower))
+    thin = tl.minimum(alpha, 0.5)
+    thin = twice_atanh(thin / (2 - thin))  # -log(1 - alpha)
+    blended = tl.where(alpha < 0.5, thin, tl.maximum(-opaque, 0.0))
+    return tl.where(sole, tau, blended), alpha
+
+
+@triton.jit
 def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, head, inverse_t, tau, asked,
            K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
-    """Optical depths after blending (``blending.blend_shares`` and ``blended_optical_depth``)."""
+    """Optical depths after blending (``blending.blend_shares`` and ``blend``)."""
     thick = asked & (tau > NEGLIGIBLE)
     vote_of_head, highest, others = tau * 0, tau * 0 - 1e30, tau * 0
     for k in range(K):
@@ -362,13 +373,7 @@ def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, he
         )
     sole = others == 0
     odds = tl.where(sole, 0.0, highest - vote_of_head + tl.log(tl.where(sole, 1.0, others)))
-    log_share, log_rest = -softplus(odds), -softplus(-odds)
-    alpha, lower = one_minus_exp(tau) * tl.exp(log_share), log_share - tau
-    opaque = tl.maximum(log_rest, lower) + softplus(-tl.abs(log_rest - lower))
-    thin = tl.minimum(alpha, 0.5)
-    thin = twice_atanh(thin / (2 - thin))  # -log(1 - alpha)
-    blended = tl.where(alpha < 0.5, thin, tl.maximum(-opaque, 0.0))
-    blended = tl.where(sole, tau, blended)
+    blended, _ = blend(tau, -softplus(odds), -softplus(-odds), sole)
     return tl.where(thick, blended, tau / (K + HAS_CUBE))
 
 
