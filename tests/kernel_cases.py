@@ -243,7 +243,8 @@ def _lookups(device: str, shapes: Shapes) -> list[tuple]:
     for mpis in shapes.mpis:
         layout = _scene(device, shapes.cube, mpis)[0]
         number = torch.arange(8 * RAYS, device=device)
-        cases.append((layout, number % layout.num_heads, number % 6, 2.4 * _random(device, len(number), 3) - 1.2))
+        samples = (layout, number % layout.num_heads, number % 6, 2.4 * _random(device, len(number), 3) - 1.2)
+        cases += [(*samples, None), (*samples, torch.tensor([7 * RAYS], device=device))]
     return cases
 
 

@@ -203,10 +203,8 @@ class MMPIField(TexelTables):
         room, ndc = samples.capacity, samples.ndc
         if rays.origins.requires_grad or rays.directions.requires_grad:
             ndc = moving(self.layout, rays.origins, rays.directions, samples)
-        rows, weights = texel_rows(self.layout, samples.heads, samples.planes, ndc)
-        if room is not None:  # behind the last ray, the empty brick is read
-            index = torch.arange(len(rows), device=rows.device)[:, None]
-            rows = torch.where(index < samples.starts[-1], rows, index % BRICK)
+        count = None if room is None else samples.starts[-1:]
+        rows, weights = texel_rows(self.layout, samples.heads, samples.planes, ndc, count)
         distinct = index_rows(rows, len(self.density), most=None if room is None else room.rows)
         read = (distinct.unique, *(read_rows(table, distinct.unique) for table in (self.density, self.features)))
         return Lookup(ndc, Taps(distinct.positions, weights), *read, distinct=distinct.count)

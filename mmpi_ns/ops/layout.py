@@ -105,22 +105,22 @@ class SceneLayout:
         return self.cube_interval if k >= len(self.mpis) else 256.0 / self.mpis[k].planes * self.depth_scale
 
     @cached_property
-    def depth_constants(self) -> tuple[Float[Tensor, "H L"], Float[Tensor, "H"]]:
-        """Biases of all planes of each head, and its interval; the cube has one bias."""
+    def depth_constants(self) -> tuple[Float[Tensor, "H L"], Float[Tensor, "H"], Float[Tensor, "H"]]:
+        """Biases of all planes of each head, and its interval in float32 and float64; the cube has one bias."""
         device, in_cube = self.frames.origins.device, [] if self.cube is None else [torch.tensor([self.cube_bias])]
         rows = [x.to(device) for x in (*self.biases, *in_cube)]
         biases = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=self.cube_bias)
         intervals = [self.interval(k) for k in range(self.num_heads)]
-        return biases, torch.tensor(intervals, dtype=torch.float64, device=device)
+        return biases, *(torch.tensor(intervals, dtype=t, device=device) for t in (torch.float32, torch.float64))
 
     def optical_depth(
         self, heads: Int[Tensor, "N"] | int, raw: Float[Tensor, "N"], planes: Int[Tensor, "N"]
     ) -> Float[Tensor, "N"]:
         """tau from raw densities: softplus(raw + bias) times the interval, in float32 or wider."""
         raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-        biases, intervals = self.depth_constants
+        biases, *intervals = self.depth_constants
         bias = biases[heads, planes.clamp(max=biases.shape[1] - 1)]  # any, of the same ones, in the cube
-        return torch.nn.functional.softplus(raw + bias) * intervals.to(raw.dtype)[heads]
+        return torch.nn.functional.softplus(raw + bias) * intervals[raw.dtype == torch.float64][heads]
 
 
 def frame_rows(frames: Frames) -> Float[Tensor, "K 19"]:

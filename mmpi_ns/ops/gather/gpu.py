@@ -40,7 +40,7 @@ def _read_taps(values, positions, shares, number, inside, channels, column, TAPS
 
 @triton.jit(do_not_specialize=("num_rays",))
 def gather_kernel(
-    values, positions, shares, starts, weights, chosen, sums, num_rays, channels,
+    values, positions, shares, starts, weights, chosen, gathered, masses, firsts, seconds, num_rays, channels,
     TAPS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums over samples of weight times texel, of weight, and of weight times squared colour, of the chosen rays."""
@@ -59,10 +59,11 @@ def gather_kernel(
         total += value
         squares += value * activate(raw, column)
         mass += weight
-    to = sums + ray[:, None] * (channels + 4)
-    tl.store(to + column, total, inside[:, None] & (column < channels))
-    tl.store(sums + ray * (channels + 4) + channels, mass, inside)
-    tl.store(to + channels + 1 + column, squares, inside[:, None] & (column < 3))
+    filled, is_color, of_color = inside[:, None] & (column < channels), inside[:, None] & (column < 3), 3 * ray[:, None]
+    tl.store(gathered + ray[:, None] * channels + column, total, filled)
+    tl.store(masses + ray, mass, inside)
+    tl.store(firsts + of_color + column, total, is_color)
+    tl.store(seconds + of_color + column, squares, is_color)
 
 
 @triton.jit(do_not_specialize=("count", "num_rays"))
@@ -112,16 +113,15 @@ class _GatherTaps(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         saved = [x.contiguous() for x in (values, positions, shares, starts, weights, chosen)]
         channels, device = values.shape[1], values.device
-        sums = torch.zeros(len(chosen), channels + 1 + COLORS, device=device)
+        sums = [torch.empty(len(chosen), n, device=device) for n in (channels, 1, COLORS, COLORS)]
         columns, block, warps = sizes(channels, device)
         launch(
-            gather_kernel, len(chosen) if len(weights) else 0, block, *saved, sums, len(chosen), channels,
+            gather_kernel, len(chosen), block, *saved, *sums, len(chosen), channels,
             TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block, num_warps=warps,
         )  # fmt: skip
         ctx.save_for_backward(*saved)
-        gathered, mass, second = sums.split([channels, 1, COLORS], -1)
-        ctx.mark_non_differentiable(mass)
-        return gathered, mass, gathered[:, :COLORS].clone(), second
+        ctx.mark_non_differentiable(sums[1])
+        return tuple(sums)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:

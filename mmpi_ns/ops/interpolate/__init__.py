@@ -66,7 +66,11 @@ class Table(nn.Parameter):
 
 @operation("gpu")
 def texel_rows(
-    layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
+    layout: SceneLayout,
+    heads: Int[Tensor, "N"],
+    planes: Int[Tensor, "N"],
+    ndc: Float[Tensor, "N 3"],
+    count: Int[Tensor, "1"] | None = None,
 ) -> tuple[Int[Tensor, "N B"], Float[Tensor, "N B"]]:
     """Rows and weights of the texels around samples of several heads, with gradients to ``ndc`` where it requires them:
     four of each sample, or eight where there is a cube (``TexelGrid.trilinear``).
@@ -76,6 +80,7 @@ def texel_rows(
         heads: head of each sample.
         planes: plane of each sample; of those in the cube any number.
         ndc: position of each sample in its head.
+        count: samples from this one on read the empty brick; None: none.
     """
     names = ("depth", "height", "width", "down", "across", "first_tile")
     if (sizes := layout.packed.get("sizes")) is None:
@@ -84,8 +89,13 @@ def texel_rows(
     of_samples: dict[str, Any] = dict(zip(names, sizes[heads].unbind(-1), strict=True))
     grid = replace(layout.grids[0], **of_samples)
     if layout.cube is None:
-        return grid.bilinear(planes, ndc)
-    return grid.trilinear(ndc, planes.masked_fill(heads == len(layout.mpis), -1))
+        rows, weights = grid.bilinear(planes, ndc)
+    else:
+        rows, weights = grid.trilinear(ndc, planes.masked_fill(heads == len(layout.mpis), -1))
+    if count is not None:
+        index = torch.arange(len(rows), device=rows.device)[:, None]
+        rows = torch.where(index < count, rows, index % BRICK)
+    return rows, weights
 
 
 @operation()
@@ -197,9 +207,11 @@ class _WeighRows(torch.autograd.Function):
 
 
 @texel_rows.on_cpu
-def texel_rows_on_cpu(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
-    if ndc.requires_grad:
-        return texel_rows.reference(layout, heads, planes, ndc)
+def texel_rows_on_cpu(
+    layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor, count: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    if ndc.requires_grad or count is not None:
+        return texel_rows.reference(layout, heads, planes, ndc, count)
     taps = 4 if layout.cube is None else 8
     rows, weights = torch.empty(len(heads), taps, dtype=torch.int64), torch.empty(len(heads), taps)
     samples, scene = (x.contiguous() for x in (heads, planes, ndc)), (layout.cpu_grids, len(layout.mpis), taps)

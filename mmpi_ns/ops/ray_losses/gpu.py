@@ -96,11 +96,10 @@ class _RayLosses(torch.autograd.Function):
         ctx.constants = {"CHANNELS": channels, "EXPOSED": exposures is not None, "BLOCK": block}
         unused = [errors] * 7
         launch(ray_losses_kernel, count, block, *values, sums, errors, *unused, *ctx.numbers, BACK=False, **ctx.constants)
+        sums[4:5].div_(sums[6:].clamp(min=1))
         ctx.save_for_backward(*values, sums)
         ctx.mark_non_differentiable(errors)
-        losses = sums[:6].clone()
-        losses[4] /= sums[6].clamp(min=1)
-        return losses, errors
+        return sums[:6], errors
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
