@@ -273,8 +273,11 @@ class MMPIModel(Model):
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Any]:
         samples = outputs["training"].samples
-        intersected, kept = samples.num_intersected.mean(dtype=torch.float32), samples.starts[-1] / len(samples.dropped_mass)
-        counts = {"intersected_samples": intersected, "kept_samples": kept, "dropped_mass": samples.dropped_mass.mean()}
+        counts = {
+            "intersected_samples": samples.num_intersected.mean(dtype=torch.float32),
+            "kept_samples": samples.starts[-1] / len(samples.dropped_mass),
+            "dropped_mass": samples.dropped_mass.mean(),
+        }
         self.camera_optimizer.get_metrics_dict(counts)
         return counts
 

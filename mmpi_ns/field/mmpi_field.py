@@ -232,14 +232,12 @@ class MMPIField(TexelTables):
         lookup = lookup or self._lookup(rays, samples)
         parts = samples.by_head(len(self.grids), chosen)
         index, sizes = torch.cat(parts), [len(x) for x in parts]
-        columns = (lookup.read(lookup.features), lookup.ndc, samples.rays)
-        # Split, not sliced: the gradient of a slice is as large as the whole.
-        of_heads = (x.index_select(0, index.clamp(max=max(0, len(x) - 1))).split(sizes) for x in columns)
-        colors = [
-            self.networks.shade(networks[k], values, ndc, geometry.rotate(axes[k], directions), numbers)
-            for k, (values, ndc, numbers) in enumerate(zip(*of_heads, strict=True))
-        ]
-        return lookup.ndc.new_zeros(len(lookup.ndc) + 1, 3).index_copy(0, index, torch.cat(colors))[:-1]
+        index_in = index.clamp(max=max(0, len(samples.heads) - 1))
+        columns = (lookup.read(lookup.features), lookup.ndc, samples.heads * len(directions) + samples.rays)
+        values, ndc, rows = (x.index_select(0, index_in) for x in columns)
+        directions = geometry.rotate(axes[:, None], directions).flatten(0, 1)
+        colors = self.networks.shade(networks, sizes, values, ndc, directions, rows)
+        return lookup.ndc.new_zeros(len(lookup.ndc) + 1, 3).index_copy(0, index, colors)[:-1]
 
     def render_colors(
         self,

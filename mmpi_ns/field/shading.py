@@ -7,6 +7,7 @@ network shades the ray once. ``sample``: a network gives every sample its colour
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -71,25 +72,30 @@ class ColorNetworks(Networks):
 
     def shade(
         self,
-        number: int,
+        numbers: Sequence[int],
+        sizes: Sequence[int],
         features: Float[Tensor, "N C"],
         ndc: Float[Tensor, "N 3"],
-        directions: Float[Tensor, "R 3"],
-        rays: Int[Tensor, "N"],
+        directions: Float[Tensor, "M 3"],
+        rows: Int[Tensor, "N"],
     ) -> Float[Tensor, "N 3"]:
-        """Colours in [0, 1] of samples of one head: the first three features are their logits, to which the network
+        """Colours in [0, 1] of samples, head behind head: the first three features are their logits, to which a network
         adds the view-dependent part.
 
         Args:
-            number: of the head's network.
+            numbers: of the heads' networks.
+            sizes: samples of each head.
             features: of each sample.
             ndc: position of each sample.
-            directions: of each ray, in the head's axes; encoded once a ray.
-            rays: ray of each sample.
+            directions: of each ray in the axes of each head; encoded once.
+            rows: direction of each sample.
         """
         position = positional_encoding(ndc, self.frequencies[0])
-        direction = positional_encoding(directions, self.frequencies[1]).index_select(0, rays)
-        return torch.sigmoid(features[:, :3] + self.run(number, torch.cat([features, position, direction], -1)))
+        direction = positional_encoding(directions, self.frequencies[1]).index_select(0, rows)
+        # Split, not sliced: the gradient of a slice is as large as the whole.
+        inputs = torch.cat([features, position, direction], -1).split(list(sizes))
+        offsets = [self.run(number, x) for number, x in zip(numbers, inputs, strict=True)]
+        return torch.sigmoid(features[:, :3] + torch.cat(offsets))
 
 
 class RayShader(Networks):

@@ -111,7 +111,8 @@ class SceneLayout:
         rows = [x.to(device) for x in (*self.biases, *in_cube)]
         biases = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=self.cube_bias)
         intervals = [self.interval(k) for k in range(self.num_heads)]
-        return biases, *(torch.tensor(intervals, dtype=t, device=device) for t in (torch.float32, torch.float64))
+        exact = torch.tensor(intervals, dtype=torch.float64, device=device)
+        return biases, exact.float(), exact
 
     def optical_depth(
         self, heads: Int[Tensor, "N"] | int, raw: Float[Tensor, "N"], planes: Int[Tensor, "N"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float, Int
 from nerfstudio.cameras.rays import RayBundle
@@ -11,7 +13,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.rendering.rendered import render_rays
+from mmpi_ns.rendering.rendered import RenderedRays, render_rays
 
 RAYS = 256
 """Rays of the batch."""
@@ -20,30 +22,38 @@ CLOSE = 1e-2
 may be kept by one form alone; a wrong kernel differs by more."""
 
 
-def disagreement(field: MMPIField, bundle: RayBundle, options: MarchOptions) -> str:
+Losses = Callable[[RenderedRays], dict[str, Tensor]]
+
+
+def disagreement(field: MMPIField, bundle: RayBundle, options: MarchOptions, losses: Losses) -> str:
     """Description of the differences between compiled operations and plain torch, for rays with nears and fars; empty
-    if they agree."""
+    if they agree. ``losses`` are those of rendered rays, means over them."""
     results = {}
     for route in ("auto", "torch"):
         with dispatch.chosen(route), torch.enable_grad():
-            results[route] = _values_and_gradients(field, bundle, options)
+            results[route] = _values_and_gradients(field, bundle, options, losses)
     return ", ".join(differences(results["torch"], results["auto"]))
 
 
 Rows = tuple[Int[Tensor, "U"], Float[Tensor, "U C"]]
 
 
-def _values_and_gradients(field: MMPIField, bundle: RayBundle, options: MarchOptions) -> dict[str, Rows]:
-    """Colours, accumulation and gradients of a fixed linear function of both, by rows."""
+def _values_and_gradients(
+    field: MMPIField, bundle: RayBundle, options: MarchOptions, losses: Losses
+) -> dict[str, Rows]:
+    """Colours, accumulation, losses and gradients of a fixed linear function of all three, by rows."""
     rays = render_rays(bundle, field, options)
-    values = torch.cat([rays.rgb, rays.composite.accumulation], -1)
+    values, costs = torch.cat([rays.rgb, rays.composite.accumulation], -1), torch.stack([*losses(rays).values()])
     slopes = torch.linspace(-1, 1, values.numel(), device=values.device).view_as(values)
-    (values * slopes).sum().backward()
-    colors = torch.arange(len(values), device=values.device), values.detach().double()
+    ((values * slopes).sum() + len(values) * costs.sum()).backward()
+    by_rows = {
+        name: (torch.arange(len(x), device=x.device), x.detach().double())
+        for name, x in (("colours", values), ("losses", costs[:, None]))
+    }
     gradients = gradients_of(field)
     for parameter in field.parameters():
         parameter.grad = None
-    return {"colours": colors, **gradients}
+    return by_rows | gradients
 
 
 def gradients_of(field: MMPIField) -> dict[str, Rows]:

@@ -23,6 +23,7 @@ PLANE_ERROR = 0.6
 TV_EVERY = 4
 """Total variation is added every this many steps, with its weight multiplied by the same number."""
 
+
 def photometric(
     predicted: Float[Tensor, "R 3"], observed: Float[Tensor, "R 3"], exposure: Float[Tensor, "R 3"] | None = None
 ) -> Float[Tensor, ""]:

@@ -12,6 +12,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.viewer.viewer import Viewer
+from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.data.datamanager import MMPIDataManager
@@ -20,7 +21,7 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.placement.defaults import RAYS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
 from mmpi_ns.rendering.pipeline import MMPIPipeline
-from mmpi_ns.rendering.rendered import bounded
+from mmpi_ns.rendering.rendered import RenderedRays, bounded
 from mmpi_ns.sampler import march_options
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
@@ -38,6 +39,7 @@ from mmpi_ns.training.checkpoints import (
     states_of,
 )
 from mmpi_ns.training.frames import FrameTurns
+from mmpi_ns.training.losses import batch_losses
 from mmpi_ns.training.memory import describe, texel_bytes, training_bytes
 from mmpi_ns.training.report import TrainingLog, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, views_of
@@ -189,10 +191,15 @@ class MMPITrainer(Trainer):
         assert sources is not None, "a step has drawn rays"
         progress, field = run.progress, run.field
         g = generator(model.config.seed, progress.step, "agreement", self.device)
-        bundle, _ = sources.draw(AGREEMENT_RAYS, g)
+        bundle, batch = sources.draw(AGREEMENT_RAYS, g)
         forming = not progress.schedule.sharpened(progress.step)
         options = march_options(model.config.sampling, field.plan, forming, field.blends)
-        return disagreement(field, bounded(bundle[0], field.plan), options)
+
+        def losses(rays: RenderedRays) -> dict[str, Tensor]:
+            background = generator(model.config.seed, 0, "agreement", self.device)
+            return batch_losses(rays, field, batch["image"][0], model.config.loss, background, 0)[0]
+
+        return disagreement(field, bounded(bundle[0], field.plan), options, losses)
 
     def train_iteration(self, step: int) -> Any:
         """One step; records that it ran, and saves a window of several after its last step."""

@@ -50,7 +50,8 @@ def test_colours_and_their_gradients_equal_float64(channels, width, octaves, cou
     networks, features, *places = batch(channels, width, octaves, count)
     ndc, directions, rays = places
     given, exact, grad = features.clone().requires_grad_(), features.double().requires_grad_(), normal(count, 3, seed=4)
-    actual, wanted = networks.shade(1, given, *places), by_formula(networks, 1, exact, ndc, directions, rays, octaves)
+    actual = networks.shade([1], [count], given, *places)
+    wanted = by_formula(networks, 1, exact, ndc, directions, rays, octaves)
     assert actual.shape == (count, 3) and torch.allclose(actual.double(), wanted, atol=2e-6)
     sums = [(actual * grad).sum(), (wanted * grad).sum()]
     mine = torch.autograd.grad(sums[0], [given, networks.weights])
@@ -62,12 +63,12 @@ def test_colours_and_their_gradients_equal_float64(channels, width, octaves, cou
 
 def test_encoded_once_a_ray_or_once_a_sample_a_direction_gives_the_same_colour():
     networks, features, ndc, directions, rays = batch(4, 8, (2, 2), 6)
-    once = networks.shade(1, features, ndc, directions, rays)
-    each = networks.shade(1, features, ndc, directions[rays], torch.arange(6))
+    once = networks.shade([1], [6], features, ndc, directions, rays)
+    each = networks.shade([1], [6], features, ndc, directions[rays], torch.arange(6))
     assert torch.allclose(once, each, atol=1e-7)
 
 
 def test_colours_say_where_a_feature_is_not_a_number():
     networks, features, *places = batch(9, 32, (2, 2), 40)
     features[7, 5] = math.nan
-    assert networks.shade(1, features, *places).isnan().any(-1).nonzero().flatten().tolist() == [7]
+    assert networks.shade([1], [len(features)], features, *places).isnan().any(-1).nonzero().flatten().tolist() == [7]

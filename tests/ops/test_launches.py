@@ -9,7 +9,7 @@ from interpreted_graphs import STEPS, Tape, prepared
 
 @pytest.mark.parametrize(
     ("training", "shading", "most"),
-    [("joint", "ray", {12: 260}), ("two-phase", "sample", {4: 380, 10: 380, 13: 500})],
+    [("joint", "ray", {12: 250}), ("two-phase", "sample", {4: 335, 10: 335, 13: 430})],
     ids=["joint", "individual, blend and finetune"],
 )
 def test_a_step_on_a_cpu_has_few_operations(scene, plan_file, tmp_path, training, shading, most):

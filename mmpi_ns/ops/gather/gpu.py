@@ -121,7 +121,7 @@ class _GatherTaps(torch.autograd.Function):
         )  # fmt: skip
         ctx.save_for_backward(*saved)
         ctx.mark_non_differentiable(sums[1])
-        return tuple(sums)
+        return tuple(sums)  # type: ignore[return-value]
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:

@@ -31,8 +31,8 @@ def _add(sums, place: tl.constexpr, values):
 def ray_losses_kernel(
     colors, transmittances, masses, firsts, seconds, spreads, nears, reached, covered, exposures, images, random,
     decay, sums, errors, slopes, to_colors, to_transmittances, to_firsts, to_seconds, to_spreads, to_nears,
-    num_rays, asked, size, share, of_color, of_entropy, of_distortion, of_keypoints, of_depths, CHANNELS: tl.constexpr, EXPOSED: tl.constexpr, BACK: tl.constexpr,
-    BLOCK: tl.constexpr,
+    num_rays, asked, size, share, of_color, of_entropy, of_distortion, of_keypoints, of_depths,
+    CHANNELS: tl.constexpr, EXPOSED: tl.constexpr, BACK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Losses, that of keypoints still a sum, the number of keypoints that are reached, and errors; or, BACK, the
     gradients of the rays' values."""
@@ -94,8 +94,8 @@ class _RayLosses(torch.autograd.Function):
         values = [colors if x is None else x.contiguous() for x in tensors]
         ctx.numbers = (count, asked, max(1, count // times), 1 / max(1, times * asked), *weights)
         ctx.constants = {"CHANNELS": channels, "EXPOSED": exposures is not None, "BLOCK": block}
-        unused = [errors] * 7
-        launch(ray_losses_kernel, count, block, *values, sums, errors, *unused, *ctx.numbers, BACK=False, **ctx.constants)
+        tensors = (*values, sums, errors, *[errors] * 7)
+        launch(ray_losses_kernel, count, block, *tensors, *ctx.numbers, BACK=False, **ctx.constants)
         sums[4:5].div_(sums[6:].clamp(min=1))
         ctx.save_for_backward(*values, sums)
         ctx.mark_non_differentiable(errors)
