@@ -15,8 +15,8 @@ from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.gpu_scene import block_size, launch, one_minus_exp, samples_of
 from mmpi_ns.ops.layout import dense
 
-RAYS = 64
-"""Rays per program."""
+RAYS = 32
+"""Rays per program, of one warp."""
 
 
 @triton.jit(do_not_specialize=("num_rays",))
@@ -68,7 +68,7 @@ class _CompositeWeights(torch.autograd.Function):
         of_rays = mass, accumulation, transmittance = torch.empty(3, *total.shape, device=tau.device)
         block = block_size(RAYS, tau.device)
         tensors = (tau, starts, before, total, weights, behind, *of_rays)
-        launch(composite_kernel, len(total), block, *tensors, len(total), BLOCK=block)
+        launch(composite_kernel, len(total), block, *tensors, len(total), BLOCK=block, num_warps=1)
         ctx.save_for_backward(starts, weights, behind, transmittance)
         return weights, mass, accumulation, transmittance
 
@@ -77,7 +77,7 @@ class _CompositeWeights(torch.autograd.Function):
         starts, weights, *_ = saved = ctx.saved_tensors
         gradient, block = torch.zeros_like(weights), block_size(RAYS, weights.device)
         tensors = (*saved, *(x.contiguous() for x in grad_outputs), gradient)
-        launch(composite_back_kernel, len(starts) - 1, block, *tensors, len(starts) - 1, BLOCK=block)
+        launch(composite_back_kernel, len(starts) - 1, block, *tensors, len(starts) - 1, BLOCK=block, num_warps=1)
         return gradient, None, None, None
 
 

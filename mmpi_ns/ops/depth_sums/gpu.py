@@ -15,8 +15,8 @@ from mmpi_ns.ops.depth_sums import REACH, DepthSums
 from mmpi_ns.ops.gpu_scene import block_size, launch, samples_of
 from mmpi_ns.ops.layout import dense
 
-RAYS = 64
-"""Rays per program."""
+RAYS = 32
+"""Rays per program, of one warp."""
 
 
 @triton.jit
@@ -80,7 +80,7 @@ class _DepthSums(torch.autograd.Function):
         spread, mass = torch.empty(2, count, device=device)
         reached = torch.empty(count, dtype=torch.bool, device=device)
         tensors = (weights, inverse_t, starts, *of_rays, spread, mass, reached, slopes, windows)
-        launch(depth_sums_kernel, count, block, *tensors, count, scale, REACH**2, BLOCK=block)
+        launch(depth_sums_kernel, count, block, *tensors, count, scale, REACH**2, BLOCK=block, num_warps=1)
         ctx.save_for_backward(starts, slopes, windows)
         ctx.mark_non_differentiable(reached)
         return spread, mass, reached
@@ -90,7 +90,7 @@ class _DepthSums(torch.autograd.Function):
         starts, slopes, windows = ctx.saved_tensors
         gradient, block = torch.zeros_like(slopes), block_size(RAYS, slopes.device)
         tensors = (starts, slopes, windows, *(x.contiguous() for x in grad_outputs[:2]), gradient)
-        launch(depth_sums_back_kernel, len(starts) - 1, block, *tensors, len(starts) - 1, BLOCK=block)
+        launch(depth_sums_back_kernel, len(starts) - 1, block, *tensors, len(starts) - 1, BLOCK=block, num_warps=1)
         return gradient, None, None, None, None, None
 
 

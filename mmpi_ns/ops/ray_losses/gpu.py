@@ -18,8 +18,8 @@ from mmpi_ns.ops.ray_losses import RayLosses
 
 CLIPPED, LEAST, KEYPOINT_WIDTH = map(tl.constexpr, (constants.CLIPPED, constants.LEAST, constants.KEYPOINT_WIDTH))
 DEPTH_OUTLIERS, KEYPOINT_OUTLIERS = map(tl.constexpr, (constants.DEPTH_OUTLIERS, constants.KEYPOINT_OUTLIERS))
-RAYS = 64
-"""Rays per program."""
+RAYS = 32
+"""Rays per program, of one warp."""
 
 
 @triton.jit
@@ -93,7 +93,7 @@ class _RayLosses(torch.autograd.Function):
         sums, errors, block = torch.zeros(7, device=device), torch.empty(count, device=device), block_size(RAYS, device)
         values = [colors if x is None else x.contiguous() for x in tensors]
         ctx.numbers = (count, asked, max(1, count // times), 1 / max(1, times * asked), *weights)
-        ctx.constants = {"CHANNELS": channels, "EXPOSED": exposures is not None, "BLOCK": block}
+        ctx.constants = {"CHANNELS": channels, "EXPOSED": exposures is not None, "BLOCK": block, "num_warps": 1}
         tensors = (*values, sums, errors, *[errors] * 7)
         launch(ray_losses_kernel, count, block, *tensors, *ctx.numbers, BACK=False, **ctx.constants)
         sums[4:5].div_(sums[6:].clamp(min=1))
@@ -153,6 +153,6 @@ def depth_targets(
     values = [targets if x is None else x.contiguous() for x in (disparities, keypoints)]
     launch(
         depth_targets_kernel, size, block, *values, counts, targets, intervals, size, least,
-        KNOWN=disparities is not None, POINTS=keypoints is not None, BLOCK=block,
+        KNOWN=disparities is not None, POINTS=keypoints is not None, BLOCK=block, num_warps=1,
     )  # fmt: skip
     return targets, intervals
