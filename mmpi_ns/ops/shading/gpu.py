@@ -59,8 +59,8 @@ def shaded_kernel(
     has = inside[:, None] & (column < 3)
     color = tl.load(inputs + ray[:, None] * width + column, has, 0.0)
     # tanh(x) = 2 / (1 + e^-2x) - 1
-    bent = 2 / (1 + tl.exp(-2 * CHANGE / MOST_CHANGE * tl.load(offsets + at, has, 0.0))) - 1
-    factor = tl.exp(-MOST_CHANGE * bent)
+    bent = 2 / (1 + tl.exp(tl.load(offsets + at, has, 0.0) * (-2 * CHANGE / MOST_CHANGE))) - 1
+    factor = tl.exp(-bent * MOST_CHANGE)
     odds = tl.where(has, color + (1 - color) * factor, 1.0)
     accumulation = tl.load(accumulations + ray, inside, 0.0)
     if BACK:
@@ -69,7 +69,7 @@ def shaded_kernel(
         slope = slope * accumulation[:, None] * factor / (odds * odds)
         filled = inside[:, None] & (column < width)
         tl.store(to_inputs + ray[:, None] * width + column, tl.where(has, slope, 0.0), filled)
-        tl.store(to_offsets + at, CHANGE * slope * color * (1 - color) * (1 - bent * bent), has)
+        tl.store(to_offsets + at, slope * CHANGE * color * (1 - color) * (1 - bent * bent), has)
     else:
         tl.store(colors + at, accumulation[:, None] * color / odds, has)
 
@@ -126,4 +126,4 @@ def shader_inputs(gathered: Tensor, mass: Tensor, directions: Tensor, frequencie
 
 
 def shaded(inputs: Tensor, offset: Tensor, accumulation: Tensor) -> Tensor:
-    return _Shaded.apply(*dense(inputs, offset, accumulation))  # type: ignore[no-any-return]
+    return _Shaded.apply(*dense(inputs, offset.float(), accumulation))  # type: ignore[no-any-return]
