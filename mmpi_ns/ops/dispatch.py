@@ -70,19 +70,20 @@ class Operation(Generic[P, R]):
         return form
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        bound = self.signature.bind(*args, **kwargs)
-        bound.apply_defaults()
-        form = form_of(self.name, *tensors_in(bound.args))
-        return function(self.name, form)(*bound.args)
+        form = form_of(self.name, *tensors_in((*args, *kwargs.values())))
+        return function(self.name, form)(*args, **kwargs)
 
-    def _in_cpp(self, *values: Any) -> Any:
+    def _in_cpp(self, *args: Any, **kwargs: Any) -> Any:
         """``mmpi_NAME(begin, end, *arguments, *sizes, *results)`` in C++ as the form for a CPU.
 
         Arguments are those of the definition, a named tuple's fields one by one; sizes what the letters in their
         annotations stand for, in the order in which they occur; results the tensor, or those of the named tuple, that
         it returns. Tensors of another type than annotated (int64 and float32, unless it names one) take the definition.
         """
-        hints, forms, least, sizes, passed = self.hints, annotated(self.reference), self.least, {}, []
+        bound = self.signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        values, hints, forms, least = bound.args, self.hints, annotated(self.reference), self.least
+        sizes, passed = {}, []
         for name, value in zip(self.signature.parameters, values, strict=True):
             is_group, tensors, owner = hasattr(value, "_asdict"), {name: value}, self.reference
             if not is_group and not isinstance(value, Tensor):

@@ -105,23 +105,27 @@ class SceneLayout:
         return self.cube_interval if k >= len(self.mpis) else 256.0 / self.mpis[k].planes * self.depth_scale
 
     @cached_property
-    def depth_constants(self) -> tuple[Float[Tensor, "H L"], Float[Tensor, "H"], Float[Tensor, "H"]]:
-        """Biases of all planes of each head, and its interval in float32 and float64; the cube has one bias."""
+    def depth_constants(self) -> tuple[int, Float[Tensor, "H*L"], Float[Tensor, "H"], Float[Tensor, "H"]]:
+        """Most planes of a head; biases of so many planes of each, and its interval in float32 and float64; the cube
+        has one bias."""
         device, in_cube = self.frames.origins.device, [] if self.cube is None else [torch.tensor([self.cube_bias])]
         rows = [x.to(device) for x in (*self.biases, *in_cube)]
         biases = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=self.cube_bias)
         intervals = [self.interval(k) for k in range(self.num_heads)]
         exact = torch.tensor(intervals, dtype=torch.float64, device=device)
-        return biases, exact.float(), exact
+        return biases.shape[1], biases.flatten(), exact.float(), exact
 
     def optical_depth(
         self, heads: Int[Tensor, "N"] | int, raw: Float[Tensor, "N"], planes: Int[Tensor, "N"]
     ) -> Float[Tensor, "N"]:
         """tau from raw densities: softplus(raw + bias) times the interval, in float32 or wider."""
         raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-        biases, *intervals = self.depth_constants
-        bias = biases[heads, planes.clamp(max=biases.shape[1] - 1)]  # any, of the same ones, in the cube
-        return torch.nn.functional.softplus(raw + bias) * intervals[raw.dtype == torch.float64][heads]
+        most, biases, *intervals = self.depth_constants
+        heads = torch.full_like(planes, heads) if isinstance(heads, int) else heads
+        planes = planes.clamp(max=most - 1)  # any, of the same ones, in the cube
+        bias = biases.index_select(0, torch.add(planes, heads, alpha=most))
+        interval = intervals[raw.dtype == torch.float64].index_select(0, heads)
+        return torch.nn.functional.softplus(raw + bias) * interval
 
 
 def frame_rows(frames: Frames) -> Float[Tensor, "K 19"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import math
 import os
 import subprocess
@@ -28,6 +29,16 @@ def operations():
 
 def test_every_operation_with_a_gpu_form_has_cases(operations):
     assert set(CASES) == {name for name, each in operations.items() if "gpu" in each.compiled}
+
+
+def test_all_forms_of_an_operation_take_the_same_arguments(operations):
+    for name, each in operations.items():
+        wanted = [(p.name, p.default) for p in each.signature.parameters.values()]
+        for form in each.compiled:
+            made = dispatch.function(name, form)
+            if getattr(made, "func", None) != each._in_cpp:
+                given = inspect.signature(made).parameters.values()
+                assert [(p.name, p.default) for p in given] == wanted, (name, form)
 
 
 @pytest.fixture
