@@ -25,7 +25,6 @@ from mmpi_ns.data.dataset import MMPIDataset
 from mmpi_ns.data.priors import Gains, Priors, PriorsConfig
 from mmpi_ns.data.ray_sources import PixelPool, RaySources, rays_to_keypoints
 from mmpi_ns.data.rays import CameraRays, TrainingRays
-from mmpi_ns.ops.dispatch import on_gpu
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, log
@@ -96,8 +95,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """The sources of all cameras, if they are in memory all the time."""
         self._drawn: tuple[RaySources, tuple[int, int], Batch] | None = None
         """Rays of some steps with their sources, number of rays and number of the steps."""
-        self._place, self._place_on_gpu = 0, torch.zeros(1, dtype=torch.int64, device=kwargs.get("device", "cpu"))
-        """Place of the step among them; that on a GPU is read by recorded steps."""
+        self._is_replayed = False
+        self._place, self._place_read = 0, torch.zeros(1, dtype=torch.int64, device=kwargs.get("device", "cpu"))
+        """Place of the step among them, and what recorded steps read of it."""
         parser: Any = config.dataparser
         factor = getattr(parser, "downscale_factor", None)
         if isinstance(factor, float) and factor.is_integer():  # ns-render dataset gives 2.0
@@ -242,26 +242,30 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.draw_rays(step)
         assert self._drawn is not None
         rays, batch = self._drawn[2]
-        if not on_gpu(rays.origins):
+        if not self._is_replayed:
             return rays[self._place], {name: values[self._place] for name, values in batch.items()}
-        place = self._place_on_gpu
+        place = self._place_read
         return rays[place][0], {name: values[place][0] for name, values in batch.items()}
+
+    def keep_memory(self) -> None:
+        """From now on recorded steps read the rays, so that those of later steps take the same memory."""
+        self._is_replayed, self._drawn = True, None
 
     def draw_rays(self, step: int) -> None:
         """Draws the rays of ``AT_ONCE`` steps together, unless they are there: drawing is a hundred small operations,
-        and their number is its cost. On a GPU those of the next steps take the same memory, for recorded steps."""
+        and their number is its cost."""
         sources, (number, place), pixel_rays = self._current(), divmod(step, AT_ONCE), self._pixel_rays
         held = self._drawn if self._drawn is not None and self._drawn[0] is sources else None
         if held is None or held[1] != (pixel_rays, number):
             steps = range(number * AT_ONCE, (number + 1) * AT_ONCE)
             drawn = sources.draw(pixel_rays, *(generator(self.config.seed, i, "pixels", self.device) for i in steps))
-            if on_gpu(drawn[0].origins) and held is not None and held[1][0] == pixel_rays:
+            if self._is_replayed and held is not None and held[1][0] == pixel_rays:
                 for old, new in zip(_tensors(held[2]), _tensors(drawn), strict=True):
                     old.copy_(new)
                 drawn = held[2]
             self._drawn = sources, (pixel_rays, number), drawn
-        if on_gpu(self._place_on_gpu) and place != self._place:
-            self._place_on_gpu.fill_(place)
+        if self._is_replayed and (held is None or place != self._place):
+            self._place_read.fill_(place)
         self._place = place
 
     def _current(self) -> RaySources:

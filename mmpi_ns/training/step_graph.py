@@ -100,6 +100,7 @@ class StepGraphs:
         self.model, self.manager, self.optimizers = model, manager, optimizers
         self.new_recorder = recorder or Recorder
         self.draws: Generators = model.draws
+        manager.keep_memory()
         self.is_off = False
         """Recording has failed: steps run one operation at a time."""
         self.repeated = self.lost = 0

@@ -15,7 +15,7 @@ from interpreted_graphs import STEPS, Tape, prepared
 def test_a_step_on_a_cpu_has_few_operations(scene, plan_file, tmp_path, training, shading, most):
     """In each phase, with total variation where densities train; steps whose rays are drawn are not among them."""
     run, graphs, _ = prepared(scene, plan_file, tmp_path, training, shading)
-    graphs.is_off = True
+    graphs.is_off, graphs.manager._is_replayed = True, False
     actual = {}
     for step in range(STEPS):
         with Tape() as tape:

@@ -11,8 +11,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.field import shading as definition
 from mmpi_ns.ops import shading as constants
+from mmpi_ns.ops.dispatch import OPERATIONS
 from mmpi_ns.ops.gpu_scene import block_size, launch
 from mmpi_ns.ops.layout import dense
 
@@ -121,7 +121,7 @@ class _Shaded(torch.autograd.Function):
 
 def shader_inputs(gathered: Tensor, mass: Tensor, directions: Tensor, frequencies: int) -> Tensor:
     if directions.requires_grad:
-        return definition.shader_inputs.reference(gathered, mass, directions, frequencies)
+        return OPERATIONS["shader_inputs"].reference(gathered, mass, directions, frequencies)
     return _ShaderInputs.apply(*dense(gathered, mass, directions), frequencies)  # type: ignore[no-any-return]
 
 
