@@ -40,7 +40,13 @@ bool place(const Scene& scene, const Packet& rays, const std::vector<Local>& loc
     return inside;
 }
 
-inline float softplus(float x) { return x > 20 ? x : std::log1p(std::exp(x)); }
+// -log(1 - x) for 0 <= x <= 1/2, to a few ulp: 2 atanh(x / (2 - x)).
+inline float minus_log_rest(float x) {
+    const float z = x / (2 - x), q = z * z; // q <= 1/9
+    float p = 1.0f / 15;
+    for (int n = 13; n > 0; n -= 2) p = p * q + 1.0f / n;
+    return 2 * z * p;
+}
 
 // The texels whose reliabilities are the votes on a sample, of each head in whose frustum it lies. They are looked up, and
 // prefetched, some time before they are read: heads have millions of texels, and neighbouring samples other ones.
@@ -85,12 +91,10 @@ struct Votes {
         }
         if (!count) return tau; // the sole cover
         for (size_t i = 0; i < count; i++) others += std::exp(votes[i].value - highest);
-        const float odds = highest - vote_of_head + std::log(others);
-        const float log_share = -softplus(odds), log_rest = -softplus(-odds);
-        const float alpha = -std::expm1(-tau) * std::exp(log_share);
-        if (alpha < 0.5f) return -std::log1p(-alpha);
-        const float a = log_rest, b = log_share - tau;
-        return std::max(-(std::max(a, b) + softplus(-std::abs(a - b))), 0.0f);
+        // With the others' share over its own, w: P = 1 / (1 + w), and 1 - alpha' = (w + e^-tau) / (1 + w).
+        const float ratio = others * std::exp(highest - vote_of_head), alpha = -std::expm1(-tau) / (1 + ratio);
+        if (alpha < 0.5f) return minus_log_rest(alpha);
+        return std::log((1 + ratio) / std::max(ratio + std::exp(-tau), std::numeric_limits<float>::min()));
     }
 };
 
