@@ -102,6 +102,16 @@ def test_adam_on_rows_is_that_of_float64_and_leaves_the_rest_alone(channels, dty
     assert torch.equal(param[:BRICK], before[:BRICK]) and not torch.equal(param, before)
 
 
+def test_adam_on_all_of_a_tensor_is_that_of_float64():
+    param, moments, grad = normal(2, 700), normal(2, 2, 700, seed=2).abs(), normal(2, 700, seed=1).clamp(min=0)
+    constants = AdamConstants(0.9, 0.99, 0.3, 1e-8, 0.05)
+    wanted, before = (param.double(), moments.double()), param.clone()
+    adam_rows.reference(*wanted, None, grad.double(), constants)
+    adam_rows(param, moments, None, grad, constants)
+    assert torch.allclose(param.double(), wanted[0], atol=1e-6) and torch.allclose(moments.double(), wanted[1])
+    assert torch.equal(param == before, grad == 0)
+
+
 # March ---------------------------------------------------------------------------------------------------------------
 
 
