@@ -68,11 +68,18 @@ def run_command(words: list[str], log: Path, threads: int, **variables: str) -> 
 
 
 def train_and_evaluate(
-    scene: Scene, folder: Path, method: str, options: Sequence[str], asked: Sequence[str], threads: int
+    scene: Scene,
+    folder: Path,
+    method: str,
+    options: Sequence[str],
+    asked: Sequence[str],
+    threads: int,
+    resumes: bool = False,
 ) -> tuple[Path, dict[str, Any], dict[str, Any]]:
     """``ns-train`` with some options, and ``ns-eval`` with what is asked, as a user types them; logs are in the folder.
 
-    The cache is empty but for the compiled operations, so that priors are computed. An unfinished run is deleted.
+    The cache is empty but for the compiled operations, so that priors are computed. An interrupted training is deleted,
+    or ``resumes`` from its last checkpoint; what it took is not known then.
 
     Returns:
         The run's folder, the results of ns-eval, and for the row: what training took, threads, machine and commit.
@@ -81,7 +88,12 @@ def train_and_evaluate(
     place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
     size = ["--data", str(scene.data), "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
     run, results = folder / "run" / method / "1", folder / "eval.json"
-    shutil.rmtree(run, ignore_errors=True)
+    checkpoints = run / "nerfstudio_models"
+    resumed = resumes and checkpoints.is_dir() and any(checkpoints.iterdir())
+    if resumed:
+        place += ["--load-dir", str(checkpoints)]
+    else:
+        shutil.rmtree(run, ignore_errors=True)
     with TemporaryDirectory() as cache:
         for operations in (build.OPS, Path(mmpi_priors.ops.__file__).parent):
             build.library(operations)
@@ -93,8 +105,8 @@ def train_and_evaluate(
         used = run_command(command, folder / "train.log", threads, XDG_CACHE_HOME=cache)
     words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(results), *asked]
     run_command(words, folder / "eval.log", threads)
-    made = {"train_seconds": used.seconds, "processor_seconds": used.processor_seconds, "gib": used.gib}
-    made |= {"threads": threads, "processor": processor(), "commit": commit()}
+    took = {"train_seconds": used.seconds, "processor_seconds": used.processor_seconds, "gib": used.gib}
+    made = ({} if resumed else took) | {"threads": threads, "processor": processor(), "commit": commit()}
     return run, read_json(results)["results"], made | {"date": date.today().isoformat()}
 
 

@@ -1,7 +1,8 @@
 """Makes every number of README.md and docs/results/README.md with the real commands, as a user types them.
 
-    make results DATA=captures/          # captures by their names below; what is finished is kept, so it resumes
+    make results DATA=captures/          # captures by their names below
 
+Finished rows are kept, and an interrupted training goes on from its last checkpoint.
 Captures that the folder lacks are left out, and the pages name them.
 """
 
@@ -147,7 +148,7 @@ class Results(Bench):
         renders = ["--render-output-path", str(folder / "renders")]
         data = self.data / variant.capture
         scene = Scene(data if variant.first is None else piece(data, variant.first, folder / "piece"), variant.factor)
-        _, results, made = train_and_evaluate(scene, folder, variant.method, options, renders, self.cores)
+        _, results, made = train_and_evaluate(scene, folder, variant.method, options, renders, self.cores, True)
         row = {k: results[k] for k in ("psnr", "ssim", "field_psnr", "field_ssim") if k in results}
         row |= {"key": variant.key, "capture": variant.scene}
         row |= {"name": f"`{variant.method}`" + (f", {variant.name}" if variant.name != "defaults" else "")}
@@ -215,7 +216,9 @@ def readme_table(made: dict[str, Row], scored: Row) -> str:
         "capture": "{capture}",
         "PSNR / SSIM": "{psnr:.2f} / {ssim:.3f}",
         "field alone": "{field_psnr:.2f} / {field_ssim:.3f}",
-        "processor time, memory": lambda r: f"{r['processor_seconds'] / 60:.0f} min, {r['gib']:.1f} GiB",
+        "processor time, memory": lambda r: (
+            f"{r['processor_seconds'] / 60:.0f} min, {r['gib']:.1f} GiB" if r["processor_seconds"] else ""
+        ),
         "3D Gaussian splatting on a CPU": "{other}",
     }
     return table(columns, lines)
@@ -269,7 +272,8 @@ def draw(path: Path, made: dict[str, Row], scored: Row) -> None:
     paper, _ = ours.pop("paper", []), ours.pop("sizes", [])
     if len({content["made"]["processor"] for name, content in made.items() if name in ours}) > 1:
         del ours["defaults"]  # seconds of two processors are no line
-    lengths = sorted((r for rows in ours.values() for r in rows), key=lambda r: r["processor_seconds"])
+    timed = (r for rows in ours.values() for r in rows if r["processor_seconds"])
+    lengths = sorted(timed, key=lambda r: r["processor_seconds"])
     if not lengths:
         return
     kinds: tuple[tuple[str, list[Row], str, str], ...] = (
