@@ -9,6 +9,7 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from threading import current_thread, main_thread
+from typing import Any
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 """Of mallopt, in malloc.h."""
@@ -61,20 +62,26 @@ def signals_go_to(handle: Callable[[int], object]) -> Iterator[None]:
     if current_thread() is not main_thread():
         yield
         return
+    hung_up: list[int] = []
     with ExitStack() as before:
 
+        def restore(number: int, usual: Any) -> None:
+            if number not in hung_up:  # the shell sends it again, at any moment
+                signal.signal(number, usual)
+
         def first(number: int, _: object) -> None:
-            before.close()
             if number == signal.SIGHUP:
-                signal.signal(number, signal.SIG_IGN)  # the shell sends it again
+                hung_up.append(number)
+                signal.signal(number, signal.SIG_IGN)
                 for output in (1, 2):
                     if stat.S_ISCHR(os.fstat(output).st_mode):  # the terminal, on which every word would be an error
                         discard(output)
+            before.close()
             handle(number)
 
         for number in SIGNALS:
             usual = signal.getsignal(number)
             if number != signal.SIGHUP or usual != signal.SIG_IGN:
-                before.callback(signal.signal, number, usual or signal.SIG_DFL)
+                before.callback(restore, number, usual or signal.SIG_DFL)
                 signal.signal(number, first)
         yield

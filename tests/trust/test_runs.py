@@ -82,8 +82,9 @@ def test_a_run_is_saved_where_those_who_read_its_output_went_too(whole_scene, tm
         time.sleep(0.02)
         with suppress(BlockingIOError):
             said += os.read(reader, 10_000)
+    running.send(numbers[0])
     os.close(reader)
-    for number in numbers:
+    for number in numbers[1:]:
         running.send(number)
     assert running.end().status == 128 + numbers[0], said
     assert len(list((folder_of(tmp_path) / "nerfstudio_models").iterdir())) == 1
