@@ -110,8 +110,9 @@ class TapeRecorder:
 
 
 STEPS = 16
-MOST = {"joint": (130, 145), "individual": (275, 295), "blend": (225, 225), "finetune": (295, 320)}
-"""Launches of a step in each phase, without and with total variation, of two MPIs and a cube."""
+MOST = {"joint": (118, 142), "individual": (268, 292), "blend": (221, 0), "finetune": (294, 0)}
+"""Launches of a step in each phase, without and with total variation (0: none such here), of two MPIs and a cube: the
+numbers of docs/gpu.md."""
 
 
 def prepared(scene, plan_file, folder, training="joint", shading="ray", recorder=None):

@@ -349,9 +349,8 @@ def blend(tau, log_share, log_rest, sole):
     """Optical depths after blending (``blending.blended_optical_depth``), and alphas times shares."""
     alpha, lower = one_minus_exp(tau) * tl.exp(log_share), log_share - tau
     opaque = tl.maximum(log_rest, lower) + softplus(-tl.abs(log_rest - lower))
-    thin = tl.minimum(alpha, 0.5)
-    thin = twice_atanh(thin / (2 - thin))  # -log(1 - alpha)
-    blended = tl.where(alpha < 0.5, thin, tl.maximum(-opaque, 0.0))
+    thin = tl.minimum(alpha, 0.5)  # of which -log(1 - alpha) is
+    blended = tl.where(alpha < 0.5, twice_atanh(thin / (2 - thin)), tl.maximum(-opaque, 0.0))
     return tl.where(sole, tau, blended), alpha
 
 
