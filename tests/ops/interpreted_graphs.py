@@ -150,7 +150,7 @@ def prepared(scene, plan_file, folder, training="joint", shading="ray", recorder
 def test_recorded_steps_train_what_steps_one_operation_at_a_time_do(scene, plan_file, tmp_path, training, shading):
     run, graphs, recorder = prepared(scene, plan_file, tmp_path / "a", training, shading)
     plain, by_operations, _ = prepared(scene, plan_file, tmp_path / "b", training, shading)
-    by_operations.is_off = True
+    by_operations.is_off, by_operations.manager._is_replayed = True, False  # which draws as on a CPU
     for step in range(STEPS):
         said, expected = run(step), plain(step)
         assert len(said) == len(expected)
