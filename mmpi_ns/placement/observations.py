@@ -68,6 +68,11 @@ class Observations:
         return self.camera_to_worlds[:, :, 3]
 
     @property
+    def focal(self) -> float:
+        """Median focal length in pixels."""
+        return float(np.median(self.intrinsics[:, :2]))
+
+    @property
     def tracked(self) -> tuple[NDArray[np.int64], Array]:
         """Camera [S] and point [S, 3] of each keypoint of SfM; those of estimated surfaces are too inaccurate for
         depths."""

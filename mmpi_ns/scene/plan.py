@@ -69,6 +69,12 @@ class MPIPlan:
         return self.depth_share / (self.near * (self.planes - 1))
 
     @property
+    def texel_tangent(self) -> float:
+        """Tangent, seen from the origin, between neighbouring rows or columns, whichever are closer."""
+        u0, u1, v0, v1 = self.extent
+        return min((u1 - u0) / (self.width - 1), (v1 - v0) / (self.height - 1))
+
+    @property
     def texels(self) -> int:
         return self.planes * self.height * self.width
 

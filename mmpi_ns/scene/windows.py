@@ -59,6 +59,11 @@ class WindowedPlan:
         return tuple(w.plan for w in self.windows)
 
     @property
+    def texel_tangent(self) -> float:
+        """Smallest distance of texels, as a tangent seen from the origin of their MPI."""
+        return min(mpi.texel_tangent for plan in self.plans for mpi in plan.mpis)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of all heads, window after window."""
         if len(self) == 1:

@@ -19,6 +19,9 @@ GROWING_SHARE, FULL_STEPS = 0.5, 1250
 Runs of at most so many steps draw all; longer ones draw at least as many rays in total (docs/ablations.md)."""
 MOST_GROWING = 4000
 """Steps that ``growth_shares`` are of in a longer first phase with depth priors: surfaces need no more to form."""
+COARSE_PIXELS, SOONER = 16.0, 4.0
+"""Texels that span more pixels double ``SOONER`` times as early where there are depth priors: near surfaces that few
+images show are lost in such texels (docs/ablations.md)."""
 COPIES_FROM = 0.75
 """Share of the period of high learning rates after which MPIs may get finer copies."""
 
@@ -133,10 +136,21 @@ class Schedule:
         return Schedule(phases=phases, **lists, **data)
 
 
-def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, has_depths: bool = False) -> Schedule:
-    """The schedule of a run of ``total_steps`` steps a window; nothing is released before texels have doubled.
-    ``has_depths``: training starts with surfaces (``initial.py``). Raises InputError if no step is left for the first
-    phase, growth goes backwards, or rates never fall."""
+def make_schedule(
+    config: ScheduleConfig, total_steps: int, windows: int = 1, has_depths: bool = False, texel_pixels: float = 0.0
+) -> Schedule:
+    """The schedule of a run; nothing is released before texels have doubled.
+
+    Args:
+        config: options.
+        total_steps: of a window.
+        windows: of the capture.
+        has_depths: training starts with surfaces (``initial.py``).
+        texel_pixels: pixels that a texel of the plan spans.
+
+    Raises:
+        InputError: no step is left for the first phase, growth goes backwards, or rates never fall.
+    """
     if total_steps < 1:
         raise InputError(f"Training needs at least 1 step, got {total_steps}: raise --max-num-iterations.")
     check_schedule(config)
@@ -147,18 +161,28 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, ha
     phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)
     first = phases[0].end
     growing = min(first, MOST_GROWING) if has_depths else first
-    growth = tuple(max(1, round(s * growing)) for s in config.growth_shares)
+    shares = config.growth_shares
+    doublings = growth_shares(shares, texel_pixels) if has_depths else shares
+    growth = tuple(max(1, round(s * growing)) for s in doublings)
     rates = float(config.decay_decades), float(config.decay_from)
-    share = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if has_depths else 1.0
-    schedule = Schedule(phases, growth, *rates, windows, growing_share=share)
-    release = [round(s * (growing if s in config.growth_shares else first)) for s in config.release_shares]
+    part = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if has_depths else 1.0
+    schedule = Schedule(phases, growth, *rates, windows, growing_share=part)
+    release = [round(s * (growing if s in shares else first)) for s in config.release_shares]
     release = sorted(set(release)) if config.release_weight > 0 else []
     # A release at a growth step comes before it, so that less grows.
     return replace(
         schedule,
         release=tuple(s for s in release if s > schedule._grown or s in growth),
-        formed=growth[(len(growth) - 1) // 2] if has_depths and growth else schedule._grown,
+        formed=round(shares[(len(shares) - 1) // 2] * growing) if has_depths and shares else schedule._grown,
     )
+
+
+def growth_shares(shares: tuple[float, ...], texel_pixels: float) -> tuple[float, ...]:
+    """The shares at which texels double until they span ``texel_pixels``: the first ones, ``SOONER`` times as early,
+    while they span more than ``COARSE_PIXELS``, and then again the first ones."""
+    count = len(shares)
+    coarse = sum(texel_pixels * 2 ** (n / 2) > COARSE_PIXELS for n in range(1, count + 1))
+    return (*(s / SOONER for s in shares[:coarse]), *shares[: count - coarse])
 
 
 def check_schedule(config: ScheduleConfig) -> None:

@@ -13,6 +13,7 @@ from mmpi_ns.placement.errors import mpi_errors
 from mmpi_ns.placement.observations import Observations, find_visible_points, pixels_per_pixel
 from mmpi_ns.placement.rule import place, texel_limits
 from mmpi_ns.scene.plan import MPIPlan
+from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.settings import PlacementConfig
 
 FOCAL, WIDTH, HEIGHT = 180.0, 310.0, 94.0
@@ -91,6 +92,8 @@ def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
     assert [m.width for m in enough.mpis] == [m.width for m in fine.mpis]
     tangents = short.mpis[0].extent[1] - short.mpis[0].extent[0]
     spans = tangents * FOCAL / (short.mpis[0].width - 1)
+    tangent = WindowedPlan.single(short).texel_tangent
+    assert observations.focal == FOCAL and tangent * FOCAL == pytest.approx(spans, rel=0.05), "of rows or columns"
     visible = find_visible_points(observations)
     # Five rays for the footprint of a texel, where every pixel has a tenth of a ray and several images see the same.
     sharing = pixels_per_pixel(observations, visible)

@@ -7,7 +7,7 @@ from training_runs import schedule_of
 
 from mmpi_ns.config import mmpi, mmpi_kitti, mmpi_scannet, mmpi_scannet_short
 from mmpi_ns.settings import ScheduleConfig
-from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule
+from mmpi_ns.training.phases import TRAINS, Phase, Schedule, growth_shares, make_schedule
 
 KINDS = ("density", "features", "colour", "reliability", "camera_opt")
 
@@ -124,3 +124,17 @@ def test_a_long_run_from_surfaces_grows_no_longer_than_a_short_one():
     assert not long.sharpened(532) and long.sharpened(533)
     assert set(long.growth[2:]) <= set(long.release), "bricks are released before they double"
     assert [s for s in long.release if s > 1067] == [2400, 4800, 8000, 12000, 15200]
+
+
+def test_texels_of_more_than_sixteen_pixels_double_sooner_where_training_starts_with_surfaces():
+    shares = ScheduleConfig().growth_shares
+    assert growth_shares(shares, 4.0) == growth_shares(shares, 0.0) == shares  # 16 pixels at first
+    assert growth_shares(shares, 4.1) == (1 / 60, *shares[:3])
+    assert growth_shares(shares, 7.8) == (1 / 60, 2 / 60, *shares[:2])  # 31.2, 22.1, 15.6 and 11 pixels
+    assert growth_shares(shares, 12.0) == tuple(s / 4 for s in shares)
+    assert growth_shares((), 100.0) == ()
+    config = ScheduleConfig()
+    large, fog = (make_schedule(config, 4000, has_depths=d, texel_pixels=7.8) for d in (True, False))
+    assert large.growth == (67, 133, 267, 533) and large.formed == 533
+    assert [s for s in large.release if s < 1200] == [600, 800, 1067], "after growth, which needs no release"
+    assert fog == make_schedule(config, 4000)
