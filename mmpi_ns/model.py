@@ -65,9 +65,11 @@ class MMPIModel(Model):
             check_memory(windows, lambda window: views_of(window, views), per_texel, device)
         phases = replace(config.schedule, training="joint" if joint else "two-phase")
         count = len(windows)
-        has_depths = capture is not None and capture.has_depths
-        pixels = 0.0 if capture is None else windows.texel_tangent * capture.observations.focal
-        schedule = make_schedule(phases, max(1, config.total_steps), count, has_depths, pixels)
+        start = (False, False, 0.0)
+        if capture is not None:
+            seen = capture.observations
+            start = (capture.has_depths, seen.looks_along_path, windows.texel_tangent * seen.focal)
+        schedule = make_schedule(phases, max(1, config.total_steps), count, *start)
         self.progress = Progress(windows, schedule)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30

@@ -90,7 +90,8 @@ class ScheduleConfig:
     """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     """Times at which the texels of a plane double, as shares of the first phase. Surfaces have formed at the last one;
-    with depth priors, at the second, and shares are of at most 4,000 steps."""
+    with depth priors, at the second, shares are of at most 4,000 steps, and 1.5 times as large unless cameras look
+    along their path."""
     release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
     """Times at which empty bricks (8 x 8 texels of a plane) are released, as shares of the first phase: after growth,
     or just before the texels double."""

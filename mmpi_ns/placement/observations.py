@@ -34,6 +34,9 @@ COVERED, LEAST_COVERED = 3000, 0.25
 """Number of points for which images are counted, and share of them that may be seen by fewer pixels than the result."""
 APART = 1e-9
 """Cameras closer together than this fraction of the largest distance (at least 1) stand in one place: no parallax."""
+ALONG = 0.9
+"""Cosine of the angle between path and line of sight beyond which a camera looks along its path; a walk through rooms
+has a median of 0.7, a drive 0.99."""
 FACTOR, SUPPORT = 1.5, 0.04
 """Content starts, for a camera, at the least depth such that depths up to FACTOR times it contain the share SUPPORT of
 its observations."""
@@ -71,6 +74,17 @@ class Observations:
     def focal(self) -> float:
         """Median focal length in pixels."""
         return float(np.median(self.intrinsics[:, :2]))
+
+    @property
+    def looks_along_path(self) -> bool:
+        """Whether most cameras look towards or away from the nearest other one: what lies just beyond the borders of an
+        image is then in an earlier or later one."""
+        poses, cosines = self.camera_to_worlds, []
+        for i, pose in enumerate(poses):
+            for j in nearest_views(poses, i, count=1):
+                step = poses[j, :, 3] - pose[:, 3]
+                cosines.append(abs(step @ pose[:, 2]) / np.linalg.norm(step))
+        return bool(cosines) and float(np.median(cosines)) > ALONG
 
     @property
     def tracked(self) -> tuple[NDArray[np.int64], Array]:

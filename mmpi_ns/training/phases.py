@@ -19,9 +19,12 @@ GROWING_SHARE, FULL_STEPS = 0.5, 1250
 Runs of at most so many steps draw all; longer ones draw at least as many rays in total (docs/ablations.md)."""
 MOST_GROWING = 4000
 """Steps that ``growth_shares`` are of in a longer first phase with depth priors: surfaces need no more to form."""
+LATER = 1.5
+"""Factor on ``growth_shares`` with depth priors where cameras do not look along their path: coarse texels extend
+surfaces beyond the borders of the training images."""
 COARSE_PIXELS, SOONER = 16.0, 4.0
-"""Texels that span more pixels double ``SOONER`` times as early where there are depth priors: near surfaces that few
-images show are lost in such texels (docs/ablations.md)."""
+"""Where they do, texels that span more pixels double ``SOONER`` times as early: near surfaces that few images show are
+lost in such texels (docs/ablations.md)."""
 COPIES_FROM = 0.75
 """Share of the period of high learning rates after which MPIs may get finer copies."""
 
@@ -137,7 +140,12 @@ class Schedule:
 
 
 def make_schedule(
-    config: ScheduleConfig, total_steps: int, windows: int = 1, has_depths: bool = False, texel_pixels: float = 0.0
+    config: ScheduleConfig,
+    total_steps: int,
+    windows: int = 1,
+    has_depths: bool = False,
+    along_path: bool = False,
+    texel_pixels: float = 0.0,
 ) -> Schedule:
     """The schedule of a run; nothing is released before texels have doubled.
 
@@ -146,6 +154,7 @@ def make_schedule(
         total_steps: of a window.
         windows: of the capture.
         has_depths: training starts with surfaces (``initial.py``).
+        along_path: cameras look along their path.
         texel_pixels: pixels that a texel of the plan spans.
 
     Raises:
@@ -161,13 +170,15 @@ def make_schedule(
     phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)
     first = phases[0].end
     growing = min(first, MOST_GROWING) if has_depths else first
-    shares = config.growth_shares
-    doublings = growth_shares(shares, texel_pixels) if has_depths else shares
+    later = LATER if has_depths and not along_path else 1.0
+    shares = tuple(min(later * s, 1.0) for s in config.growth_shares)
+    doublings = sooner_if_coarse(shares, texel_pixels) if has_depths and along_path else shares
     growth = tuple(max(1, round(s * growing)) for s in doublings)
     rates = float(config.decay_decades), float(config.decay_from)
     part = min(1.0, max(GROWING_SHARE, FULL_STEPS / total_steps)) if has_depths else 1.0
     schedule = Schedule(phases, growth, *rates, windows, growing_share=part)
-    release = [round(s * (growing if s in shares else first)) for s in config.release_shares]
+    doubling = dict(zip(config.growth_shares, shares, strict=True))
+    release = [round(doubling[s] * growing if s in doubling else s * first) for s in config.release_shares]
     release = sorted(set(release)) if config.release_weight > 0 else []
     # A release at a growth step comes before it, so that less grows.
     return replace(
@@ -177,7 +188,7 @@ def make_schedule(
     )
 
 
-def growth_shares(shares: tuple[float, ...], texel_pixels: float) -> tuple[float, ...]:
+def sooner_if_coarse(shares: tuple[float, ...], texel_pixels: float) -> tuple[float, ...]:
     """The shares at which texels double until they span ``texel_pixels``: the first ones, ``SOONER`` times as early,
     while they span more than ``COARSE_PIXELS``, and then again the first ones."""
     count = len(shares)

@@ -103,6 +103,25 @@ def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
     assert f"a texel spans {spans:.1f} pixels: finer with more steps" in short.origin_of_plan
 
 
+def test_a_drive_looks_along_its_path_and_a_walk_round_an_object_does_not():
+    drive, count = street(), 12
+    assert drive.looks_along_path
+    shuffled = np.random.default_rng(0).permutation(len(drive.centers))
+    assert replace(drive, camera_to_worlds=drive.camera_to_worlds[shuffled]).looks_along_path, "in any order"
+    sideways = drive.camera_to_worlds.copy()
+    sideways[:, :, [0, 2]] = sideways[:, :, [2, 0]] * [1, -1]
+    assert not replace(drive, camera_to_worlds=sideways).looks_along_path
+    rig = np.repeat(drive.camera_to_worlds, 2, 0)  # two cameras in each place
+    assert replace(drive, camera_to_worlds=rig, intrinsics=np.repeat(drive.intrinsics, 2, 0)).looks_along_path
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    poses = np.zeros((count, 3, 4))
+    poses[:, 1, 1] = 1
+    poses[:, :, 2] = poses[:, :, 3] = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
+    poses[:, :, 0] = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], -1)
+    assert not replace(drive, camera_to_worlds=poses).looks_along_path
+    assert not replace(drive, camera_to_worlds=drive.camera_to_worlds[:1]).looks_along_path
+
+
 def test_points_that_are_not_finite_or_behind_their_camera_are_left_out():
     observations = street()
     points = observations.points.copy()

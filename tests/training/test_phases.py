@@ -7,7 +7,7 @@ from training_runs import schedule_of
 
 from mmpi_ns.config import mmpi, mmpi_kitti, mmpi_scannet, mmpi_scannet_short
 from mmpi_ns.settings import ScheduleConfig
-from mmpi_ns.training.phases import TRAINS, Phase, Schedule, growth_shares, make_schedule
+from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule, sooner_if_coarse
 
 KINDS = ("density", "features", "colour", "reliability", "camera_opt")
 
@@ -116,7 +116,8 @@ def test_a_phase_ends_just_before_the_next_begins(step, name):
 def test_a_long_run_from_surfaces_grows_no_longer_than_a_short_one():
     config = ScheduleConfig()
     short, long, fog = (
-        make_schedule(config, n, has_depths=d) for n, d in ((4000, True), (16000, True), (16000, False))
+        make_schedule(config, n, has_depths=d, along_path=True)
+        for n, d in ((4000, True), (16000, True), (16000, False))
     )
     assert short.growth == long.growth == (267, 533, 800, 1067)
     assert fog.growth == (1067, 2133, 3200, 4267)
@@ -126,15 +127,19 @@ def test_a_long_run_from_surfaces_grows_no_longer_than_a_short_one():
     assert [s for s in long.release if s > 1067] == [2400, 4800, 8000, 12000, 15200]
 
 
-def test_texels_of_more_than_sixteen_pixels_double_sooner_where_training_starts_with_surfaces():
-    shares = ScheduleConfig().growth_shares
-    assert growth_shares(shares, 4.0) == growth_shares(shares, 0.0) == shares  # 16 pixels at first
-    assert growth_shares(shares, 4.1) == (1 / 60, *shares[:3])
-    assert growth_shares(shares, 7.8) == (1 / 60, 2 / 60, *shares[:2])  # 31.2, 22.1, 15.6 and 11 pixels
-    assert growth_shares(shares, 12.0) == tuple(s / 4 for s in shares)
-    assert growth_shares((), 100.0) == ()
+def test_coarse_texels_of_a_drive_double_sooner_and_those_of_other_captures_later():
     config = ScheduleConfig()
-    large, fog = (make_schedule(config, 4000, has_depths=d, texel_pixels=7.8) for d in (True, False))
-    assert large.growth == (67, 133, 267, 533) and large.formed == 533
-    assert [s for s in large.release if s < 1200] == [600, 800, 1067], "after growth, which needs no release"
-    assert fog == make_schedule(config, 4000)
+    shares = config.growth_shares
+    assert sooner_if_coarse(shares, 4.0) == sooner_if_coarse(shares, 0.0) == shares  # 16 pixels at first
+    assert sooner_if_coarse(shares, 4.1) == (1 / 60, *shares[:3])
+    assert sooner_if_coarse(shares, 7.8) == (1 / 60, 2 / 60, *shares[:2])  # 31.2, 22.1, 15.6 and 11 pixels
+    assert sooner_if_coarse(shares, 12.0) == tuple(s / 4 for s in shares)
+    assert sooner_if_coarse((), 100.0) == ()
+    drive, other = (make_schedule(config, 4000, has_depths=True, along_path=a, texel_pixels=7.8) for a in (True, False))
+    assert drive.growth == (67, 133, 267, 533) and drive.formed == 533
+    assert [s for s in drive.release if s < 1200] == [600, 800, 1067], "after growth, which needs no release"
+    assert other.growth == (400, 800, 1200, 1600) and other.formed == 800
+    assert other.release == (1200, 1600, 2000, 3000, 3800), "before the last two doublings, and later"
+    assert make_schedule(config, 4000, along_path=True, texel_pixels=7.8) == make_schedule(config, 4000)
+    late = make_schedule(ScheduleConfig(growth_shares=(0.5, 0.9)), 1000, has_depths=True)
+    assert late.growth == (750, 1000) and late.texel_factor(999) == 0.5
