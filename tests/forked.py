@@ -126,6 +126,7 @@ def _child(folder, name, options, arguments, memory, environment):
     sys.stderr = open(2, "w", buffering=1, closefd=False)
     sys.excepthook = sys.__excepthook__
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup, too
     os.environ.update(environment, COLUMNS="1000")  # sentences are not broken into lines
     if memory is not None:
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

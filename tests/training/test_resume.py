@@ -13,8 +13,8 @@ from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.scene.windows import WindowedPlan
 
 STEPS = 24
-"""individual 0-11 with doublings at 2 and 3 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
-0-23 with doublings at 3 and 6 and releases before 12 and 22; finer and copies are joint with finer texels from 12
+"""individual 0-11 with doublings at 2 and 4 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
+0-23 with doublings at 4 and 9 and releases before 12 and 22; finer and copies are joint with finer texels from 12
 on, and copies have finer copies from 17 on."""
 
 
@@ -50,7 +50,7 @@ def resumed(whole, scene, plan_file, tmp_path):
     return run
 
 
-STOPPED = {"split": (2, 5, 11, 12, 17, STEPS - 2), "all": (5, 11, 17), "finer": (2, 5, 11), "copies": (11, 17, 21)}
+STOPPED = {"split": (3, 5, 11, 12, 17, STEPS - 2), "all": (5, 11, 17), "finer": (3, 8, 11), "copies": (11, 17, 21)}
 """Steps before which tables grow, bricks go, texels become finer or are copied, or a phase begins; and the last."""
 
 
@@ -67,11 +67,10 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, resumed, step):
 
 
 def test_bricks_were_given_up_on_the_way_and_checkpoints_hold_the_others_alone(whole):
-    """Between steps 3 or 6, when resolution stops growing, and the end of the first phase."""
+    """Between step 4, when resolution stops growing, and the end of the first phase."""
     if "plan_file" in whole[0]:
         pytest.skip("texels become finer on the way")
-    steps = range(6, STEPS - 1) if "training" in whole[0] else range(3, 14)
-    states = [load(whole[1], step) for step in steps]
+    states = [load(whole[1], step) for step in range(4, 14)]
     rows = [len(state["pipeline"]["_model.field.density"]) for state in states]
     assert rows == sorted(rows, reverse=True) and rows[-1] < rows[0]
     for state, count in zip(states, rows, strict=True):
