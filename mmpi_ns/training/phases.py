@@ -181,11 +181,10 @@ def make_schedule(
     release = [round(doubling[s] * growing if s in doubling else s * first) for s in config.release_shares]
     release = sorted(set(release)) if config.release_weight > 0 else []
     # A release at a growth step comes before it, so that less grows.
-    return replace(
-        schedule,
-        release=tuple(s for s in release if s > schedule._grown or s in growth),
-        formed=round(shares[(len(shares) - 1) // 2] * growing) if has_depths and shares else schedule._grown,
-    )
+    formed = schedule._grown
+    if has_depths and shares:
+        formed = max(1, round(shares[(len(shares) - 1) // 2] * growing))
+    return replace(schedule, release=tuple(s for s in release if s > schedule._grown or s in growth), formed=formed)
 
 
 def sooner_if_coarse(shares: tuple[float, ...], texel_pixels: float) -> tuple[float, ...]:
