@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from training_runs import schedule_of
+from training_runs import ready, schedule_of, trainer_config
 
 from mmpi_ns.config import mmpi, mmpi_kitti, mmpi_scannet, mmpi_scannet_short
+from mmpi_ns.placement.observations import Observations
 from mmpi_ns.settings import ScheduleConfig
+from mmpi_ns.training import phases
 from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule, sooner_if_coarse
 
 KINDS = ("density", "features", "colour", "reliability", "camera_opt")
@@ -143,3 +145,22 @@ def test_coarse_texels_of_a_drive_double_sooner_and_those_of_other_captures_late
     assert make_schedule(config, 4000, along_path=True, texel_pixels=7.8) == make_schedule(config, 4000)
     late = make_schedule(ScheduleConfig(growth_shares=(0.5, 0.9)), 1000, has_depths=True)
     assert late.growth == (750, 1000) and late.texel_factor(999) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("along", "limit", "growth"),
+    [(False, 0.1, (30, 60)), (True, 2.1, (20, 40)), (True, 1.5, (5, 20)), (True, 1.3, (5, 10))],
+)
+def test_a_run_takes_path_and_pixels_of_a_texel_from_its_capture(
+    scene, plan_file, tmp_path, monkeypatch, along, limit, growth
+):
+    """``limit``: in pixels that a texel of the plan spans. Texels are 1.4 and 2 times as large before doublings."""
+    if along:
+        monkeypatch.setattr(Observations, "looks_along_path", True)
+    trainer = ready(trainer_config(scene, plan_file, tmp_path, 160, training="joint"))
+    plan, seen = trainer.pipeline.model.field.full_plan, trainer.pipeline.datamanager.observations
+    u0, u1, v0, v1 = plan.mpis[0].extent
+    spans = seen.intrinsics[0, 0] * min((u1 - u0) / (plan.mpis[0].width - 1), (v1 - v0) / (plan.mpis[0].height - 1))
+    monkeypatch.setattr(phases, "COARSE_PIXELS", limit * spans)
+    again = ready(trainer_config(scene, plan_file, tmp_path / "again", 160, training="joint"))
+    assert again.pipeline.model.progress.schedule.growth == growth
