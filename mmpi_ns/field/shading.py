@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from mmpi_ns.field.tables import replace_data
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.gather import COLORS
+from mmpi_ns.ops.network import layer_shapes, layers, network
 from mmpi_ns.ops.shading import CHANGE, LEAST_MASS, MOST_CHANGE
 
 
@@ -35,7 +36,7 @@ class Networks(nn.Module):
         super().__init__()
         self.width, self.frequencies = width, frequencies
         inputs = channels + sum(3 * (1 + 2 * octaves) for octaves in frequencies)
-        self.shapes = [(width, inputs), (width,), (width, width), (width,), (3, width), (3,)]
+        self.shapes = layer_shapes(inputs, width)
         self.weights = nn.Parameter(torch.empty(0, sum(math.prod(s) for s in self.shapes)))
         self.resize(count)
 
@@ -50,15 +51,11 @@ class Networks(nn.Module):
 
     def layers(self, number: int) -> list[Tensor]:
         """Weights and biases of the three layers of one network."""
-        parts = self.weights[number].split([math.prod(s) for s in self.shapes])
-        return [p.view(s) for p, s in zip(parts, self.shapes, strict=True)]
+        return layers(self.weights[number], self.shapes)
 
     def run(self, number: int, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
         """Outputs of one network."""
-        w1, b1, w2, b2, w3, b3 = self.layers(number)
-        hidden = torch.nn.functional.linear(inputs, w1, b1).relu_()
-        hidden = torch.nn.functional.linear(hidden, w2, b2).relu_()
-        return torch.nn.functional.linear(hidden, w3, b3)
+        return network(self.weights[number], inputs, self.width)
 
 
 def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tensor, "N E"]:

@@ -9,18 +9,6 @@ namespace {
 // e^-x, and 0 where that is no normal number: thousands of samples lie behind an opaque one.
 inline Lanes passed(Lanes x) { return pick(x < 87.0f, exp_lanes(-x), Lanes{}); }
 
-// 1 - e^-x for x >= 0, exact also where it is small. NaN stays NaN.
-inline Lanes absorbed(Lanes x) {
-    Lanes p = splat(1.0f / 40320);
-    p = p * x - 1.0f / 5040;
-    p = p * x + 1.0f / 720;
-    p = p * x - 1.0f / 120;
-    p = p * x + 1.0f / 24;
-    p = p * x - 1.0f / 6;
-    p = p * x + 0.5f;
-    return pick(x > 0.25f, 1.0f - exp_lanes(-x), x - x * x * p);
-}
-
 // Weights of the samples of rays [begin, end), and transmittance behind each of them; their sum and the optical depth of
 // each ray.
 void mmpi_composite(int64_t begin, int64_t end, const float* tau, const int64_t* starts, const float* skipped_before,

@@ -36,6 +36,13 @@ struct Packet {
         far = each<Lanes>([&](int64_t ray) { return rays.fars[ray]; });
     }
 
+    // Sixteen times one of them, for samples along it: origins and directions.
+    Packet repeated(int ray) const {
+        Packet one;
+        for (int a = 0; a < 3; a++) one.origin[a] = splat(origin[a][ray]), one.direction[a] = splat(direction[a][ray]);
+        return one;
+    }
+
     template <typename To, typename F> To each(F f) const {
         return each_lane<To>(truncated(IOTA), [&](int32_t i) { return f(numbers[i]); });
     }
@@ -51,6 +58,12 @@ struct LocalRays {
     Lanes origin[3], direction[3];
 
     LocalRays() = default;
+
+    LocalRays repeated(int ray) const { // as Packet's
+        LocalRays one;
+        for (int a = 0; a < 3; a++) one.origin[a] = splat(origin[a][ray]), one.direction[a] = splat(direction[a][ray]);
+        return one;
+    }
 
     LocalRays(const Mpi& mpi, const Packet& rays) {
         for (int a = 0; a < 3; a++) {

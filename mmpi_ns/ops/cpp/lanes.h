@@ -234,3 +234,15 @@ inline Lanes softplus_lanes(Lanes x) {
     p = p * q + 1.0f;
     return most(x, Lanes{}) + 2.0f * z * p;
 }
+
+// 1 - e^-x for x >= 0, exact also where it is small. NaN stays NaN.
+inline Lanes absorbed(Lanes x) {
+    Lanes p = splat(1.0f / 40320);
+    p = p * x - 1.0f / 5040;
+    p = p * x + 1.0f / 720;
+    p = p * x - 1.0f / 120;
+    p = p * x + 1.0f / 24;
+    p = p * x - 1.0f / 6;
+    p = p * x + 0.5f;
+    return pick(x > 0.25f, 1.0f - exp_lanes(-x), x - x * x * p);
+}

@@ -56,6 +56,9 @@ struct Scene {
 struct Cell {
     int64_t lower;
     float fraction;
+
+    Cell(int64_t lower, float fraction) : lower(lower), fraction(fraction) {}
+
     Cell(float coordinate, int64_t size) {
         const float last = float(size - 1);
         float position = (coordinate + 1) * (0.5f * last);
@@ -83,19 +86,4 @@ inline float blend(const float* table, const Corners& corners, const Cell& x, co
     const float fx = x.fraction, fy = y.fraction, gx = 1 - fx, gy = 1 - fy;
     const int64_t* row = corners.row;
     return gx * gy * table[row[0]] + fx * gy * table[row[1]] + gx * fy * table[row[2]] + fx * fy * table[row[3]];
-}
-
-inline float trilinear(const float* table, const Grid& grid, const float* ndc) {
-    const Cell x(ndc[0], grid.width), y(ndc[1], grid.height), z(ndc[2], grid.depth);
-    const Corners front(grid, z.lower, y.lower, x.lower), back(grid, z.lower + 1, y.lower, x.lower);
-    return blend(table, front, x, y) * (1 - z.fraction) + blend(table, back, x, y) * z.fraction;
-}
-
-inline int64_t nearest_texel(const Grid& grid, const float* ndc) {
-    const auto nearest = [](float coordinate, int64_t size) {
-        const float last = float(size - 1);
-        return int64_t(std::min(std::max(0.0f, std::nearbyint((coordinate + 1) * (0.5f * last))), last));
-    };
-    const int64_t x = nearest(ndc[0], grid.width), y = nearest(ndc[1], grid.height);
-    return row_in_brick(*grid.tile(nearest(ndc[2], grid.depth), y, x), y, x);
 }

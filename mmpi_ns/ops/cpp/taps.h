@@ -12,13 +12,21 @@ struct Sample {
     // At a place in a head: on one of its planes, or anywhere in the cube.
     void put(const Grid& grid, bool in_cube, int64_t plane, const float* ndc) {
         const Cell x(ndc[0], grid.width), y(ndc[1], grid.height), z(ndc[2], grid.depth);
-        for (int behind = 0; behind <= in_cube; behind++) {
-            const Corners corners(grid, (in_cube ? z.lower : plane) + behind, y.lower, x.lower);
-            const float share = !in_cube ? 1 : behind ? z.fraction : 1 - z.fraction;
-            for (int i = 0; i < 4; i++) {
-                rows[taps] = corners.row[i];
-                shares[taps++] = (i & 1 ? x.fraction : 1 - x.fraction) * (i >> 1 ? y.fraction : 1 - y.fraction) * share;
-            }
+        if (in_cube) return put(grid, z, y, x);
+        put(grid, plane, y, x, 1);
+    }
+
+    // Between two planes.
+    void put(const Grid& grid, const Cell& z, const Cell& y, const Cell& x) {
+        put(grid, z.lower, y, x, 1 - z.fraction), put(grid, z.lower + 1, y, x, z.fraction);
+    }
+
+  private:
+    void put(const Grid& grid, int64_t plane, const Cell& y, const Cell& x, float share) {
+        const Corners corners(grid, plane, y.lower, x.lower);
+        for (int i = 0; i < 4; i++) {
+            rows[taps] = corners.row[i];
+            shares[taps++] = (i & 1 ? x.fraction : 1 - x.fraction) * (i >> 1 ? y.fraction : 1 - y.fraction) * share;
         }
     }
 };

@@ -150,7 +150,8 @@ struct Outputs {
 template <typename Texels> class Walker {
   public:
     explicit Walker(const Texels& texels)
-        : texels(texels), scene(texels.scene), walks(scene.num_mpis), reads(scene.num_heads), masses(scene.num_heads) {}
+        : texels(texels), scene(texels.scene), walks(scene.num_mpis), reads(scene.num_heads), blending(scene),
+          masses(scene.num_heads) {}
 
     // Starts with `some` rays from number `first` on.
     void begin(const Rays& rays, int64_t first, int64_t some) {
@@ -228,7 +229,7 @@ template <typename Texels> class Walker {
     CubeWalks cube;
     std::vector<Seen> seen[WIDTH]; // of each ray, front to back
     Lanes transmittance, dropped, least_weight, least_transmittance;
-    Votes votes[WIDTH];
+    Blending blending;
     std::vector<float> masses;
 
     Lanes next(int32_t head) const {
@@ -244,15 +245,8 @@ template <typename Texels> class Walker {
             Lanes tau = h == scene.num_mpis ? texels.cube_tau(cube.index, packet, going, at)
                                             : texels.tau(h, walks[h], going, at);
             if (texels.blends) {
-                const uint32_t thick = bits(going & (tau > NEGLIGIBLE));
-                for (uint32_t lanes = thick; lanes; lanes &= lanes - 1) {
-                    const int i = __builtin_ctz(lanes);
-                    votes[i].look_up(scene, packet, crossings.mpis, i, h, inverse_t[i]);
-                }
-                for (uint32_t lanes = bits(going); lanes; lanes &= lanes - 1) {
-                    const int i = __builtin_ctz(lanes);
-                    tau[i] = thick >> i & 1 ? votes[i].blended(scene, tau[i]) : tau[i] / float(scene.num_heads);
-                }
+                const auto axes = [&](int64_t k) -> const LocalRays& { return crossings.mpis[k]; };
+                tau = blending.blended(packet, axes, whole(h), inverse_t, tau, going);
             }
             through = exp_lanes(-tau);
         } else {

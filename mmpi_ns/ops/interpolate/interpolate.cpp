@@ -56,13 +56,16 @@ void mmpi_chosen_rows(int64_t begin, int64_t end, const float* table, const int6
 void mmpi_weighted_rows(int64_t begin, int64_t end, const float* numbers, const int32_t* positions,
                         const float* weights, int64_t rows, int64_t channels, int64_t, int64_t taps, float* values) {
     const Table table{numbers, rows, channels};
-    for (int64_t n = begin; n < end; n++)
+    const int64_t ahead = AHEAD / taps;
+    for (int64_t n = begin; n < end; n++) {
+        for (int64_t i = (n + ahead) * taps; n + ahead < end && i < (n + ahead + 1) * taps; i++) table.prefetch(positions[i]);
         for (int64_t first = 0; first < channels; first += WIDTH) {
             Lanes sum{};
             for (int64_t i = n * taps; i < (n + 1) * taps; i++)
                 sum += weights[i] * table.read(positions[i] * channels + first);
             for (int64_t c = first; c < std::min(channels, first + WIDTH); c++) values[n * channels + c] = sum[c - first];
         }
+    }
 }
 
 // values[positions[n, b]] is the sum of weights[n, b] * grad[n], of the entries at positions [begin, end). One
@@ -70,9 +73,11 @@ void mmpi_weighted_rows(int64_t begin, int64_t end, const float* numbers, const 
 void mmpi_sum_rows(int64_t begin, int64_t end, const int32_t* positions, const float* weights, const float* grad,
                    int64_t samples, int64_t taps, int64_t channels, float* values) {
     std::fill(values + begin * channels, values + end * channels, 0.0f);
-    for (int64_t i = 0; i < samples * taps; i++)
+    for (int64_t i = 0; i < samples * taps; i++) {
+        if (i + AHEAD < samples * taps) prefetch_row(values + positions[i + AHEAD] * channels, channels);
         if (begin <= positions[i] && positions[i] < end)
             add_row(values + positions[i] * channels, grad + i / taps * channels, weights[i], channels);
+    }
 }
 
 // Rows and weights of the texels around samples [begin, end); of eight `taps`, the last four of a sample on a plane are

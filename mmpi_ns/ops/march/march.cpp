@@ -5,14 +5,6 @@
 
 namespace {
 
-// Lower texels and fractions of sixteen coordinates in [-1, 1] (as Cell).
-inline void cells(Lanes coordinate, int64_t size, IntLanes& lower, Lanes& fraction) {
-    const float last = float(size - 1);
-    const Lanes position = least(most((coordinate + 1.0f) * (0.5f * last), Lanes{}), splat(last));
-    lower = least(truncated(position), whole(int32_t(size - 2))); // positions are not negative
-    fraction = position - real(lower);
-}
-
 // Positions of sixteen samples on planes of an MPI, and the texels at their lower corners.
 struct PlaneCells {
     int32_t column[WIDTH], line[WIDTH], tile[WIDTH], texel[WIDTH], edge[WIDTH]; // edge: corners lie in several bricks
@@ -70,6 +62,8 @@ void fill_mpi(Run& run, const Scene& scene, const Crossing& at, int ray, int64_t
         store(ndc[0], x), store(ndc[1], y), store(ndc[2], 1.0f - mpi.s_scale * (w - mpi.end));
         store(inverse_t, w * dz / (1.0f - w * oz));
         const PlaneCells cells(grid, x, y, truncated(IOTA) + int32_t(first));
+        for (int j = 0; j < count; j++) __builtin_prefetch(tiles + cells.tile[j]);
+        for (int j = 0; j < count; j++) __builtin_prefetch(table + tiles[cells.tile[j]] * BRICK + cells.texel[j]);
         for (int j = 0; j < count; j++) {
             float corners[4];
             if (!cells.edge[j]) {
@@ -133,12 +127,16 @@ class Training {
   public:
     Training(const Scene& scene, float threshold, float fair_share, bool blends)
         : scene(scene), threshold(threshold), fair_share(fair_share), blends(blends), runs(scene.num_heads),
-          waiting(scene.num_heads), nearest(scene.num_heads), votes(scene.num_heads) {}
+          waiting(scene.num_heads), nearest(scene.num_heads), blending(scene), local(scene.num_mpis) {}
 
     // Marches one of sixteen rays.
     void march(const Packet& rays, const Crossings& crossings, int ray, const Samples& to, int64_t& size, float& skipped,
                float& dropped) {
         int64_t num_waiting = 0;
+        if (blends) {
+            same = rays.repeated(ray);
+            for (int64_t k = 0; k < scene.num_mpis; k++) local[k] = crossings.mpis[k].repeated(ray);
+        }
         for (int64_t h = 0; h < scene.num_heads; h++) {
             const bool in_cube = h == scene.num_mpis;
             Run& run = runs[h];
@@ -162,11 +160,7 @@ class Training {
                 dropped += transmittance; // bounds the weights of all the rest
                 break;
             }
-            float tau = run.tau[run.at], pass = run.pass[run.at];
-            if (blends) {
-                tau = tau > NEGLIGIBLE ? votes[h].blended(scene, tau) : tau / float(scene.num_heads);
-                pass = std::exp(-tau);
-            }
+            const float tau = run.tau[run.at], pass = run.pass[run.at];
             const float weight = transmittance * (1 - pass);
             if (weight > bounds.weight)
                 to.keep(run, h, tau, skipped, size);
@@ -190,7 +184,18 @@ class Training {
     std::vector<Run> runs;
     std::vector<int64_t> waiting; // heads with further samples,
     std::vector<float> nearest; // and the inverse distance of the next one of each
-    std::vector<Votes> votes;   // on that sample
+    Blending blending;
+    Packet same; // sixteen times the ray at hand, and that in the MPIs' axes
+    std::vector<LocalRays> local;
+
+    // The optical depths of a block of samples of a head.
+    void blend(Run& run, int64_t head) {
+        for (int j = run.size; j < WIDTH; j++) run.inverse_t[j] = 0;
+        const auto axes = [&](int64_t k) -> const LocalRays& { return local[k]; };
+        const Lanes tau = blending.blended(same, axes, whole(int32_t(head)), load(run.inverse_t), load(run.tau),
+                                           IOTA < float(run.size));
+        store(run.tau, tau), store(run.pass, exp_lanes(-tau));
+    }
 
     void advance(Run& run, const Packet& rays, const Crossings& crossings, int ray, int64_t head) {
         if (++run.at >= run.size) {
@@ -200,10 +205,8 @@ class Training {
                 fill_mpi(run, scene, crossings.mpis[head], ray, head, threshold > 0);
             else
                 fill_cube(run, scene, rays, ray, threshold > 0);
-            if (run.done()) return;
+            if (blends && !run.done()) blend(run, head);
         }
-        if (blends && run.tau[run.at] > NEGLIGIBLE)
-            votes[head].look_up(scene, rays, crossings.mpis, ray, head, run.next());
     }
 };
 

@@ -10,23 +10,23 @@ void mmpi_find_votes(int64_t begin, int64_t end, const Scene* scene, const float
                      int64_t* counts) {
     const Rays rays{origins, directions, inverse_t, inverse_t, nullptr, nullptr}; // one a sample; ends are not read
     const int64_t H = scene->num_heads;
-    std::vector<LocalRays> local(scene->num_mpis);
-    Votes votes[WIDTH];
+    std::vector<Votes> votes(H);
     int64_t size = begin * H;
     for (int64_t first = begin; first < end; first += WIDTH) {
-        const int64_t some = std::min<int64_t>(WIDTH, end - first);
-        const Packet packet(rays, first, some);
-        for (int64_t k = 0; k < scene->num_mpis; k++) local[k] = LocalRays(scene->mpis[k], packet);
-        for (int64_t i = 0; i < some; i++)
-            votes[i].look_up(*scene, packet, local, int(i), heads[first + i], inverse_t[first + i]);
-        for (int64_t i = 0; i < some; i++)
-            for (const Votes::Vote& vote : votes[i].votes) {
-                if (!Votes::counts(*scene, vote)) continue;
-                const Sample& texels = vote.texels;
-                numbers[size] = (first + i) * H + vote.head;
+        const Packet packet(rays, first, std::min<int64_t>(WIDTH, end - first));
+        const IntLanes own = packet.each<IntLanes>([&](int64_t n) { return int32_t(heads[n]); });
+        for (int64_t j = 0; j < H; j++) {
+            const LocalRays local = j < scene->num_mpis ? LocalRays(scene->mpis[j], packet) : LocalRays();
+            const Places places(*scene, packet, &local, j, packet.near);
+            votes[j].place(scene->grids[j], places, own == int32_t(j), packet.there);
+        }
+        for (Votes& vote : votes) vote.look_up(*scene);
+        for (int64_t j = 0; j < H; j++)
+            votes[j].each(*scene, [&](int i, const Sample& texels) {
+                numbers[size] = (first + i) * H + j;
                 std::copy_n(texels.rows, texels.taps, rows + size * texels.taps);
                 std::copy_n(texels.shares, texels.taps, weights + size++ * texels.taps);
-            }
+            });
     }
     counts[this_part] = size - begin * H;
 }
