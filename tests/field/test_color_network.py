@@ -72,3 +72,16 @@ def test_colours_say_where_a_feature_is_not_a_number():
     networks, features, *places = batch(9, 32, (2, 2), 40)
     features[7, 5] = math.nan
     assert networks.shade([1], [len(features)], features, *places).isnan().any(-1).nonzero().flatten().tolist() == [7]
+
+
+def test_colours_and_gradients_have_the_same_bits_for_any_number_of_threads(three_threads):
+    networks, features, *places = batch(9, 32, (2, 2), 3079)
+
+    def results():
+        given = features.clone().requires_grad_()
+        colors = networks.shade([0], [len(given)], given, *places)
+        return colors, *torch.autograd.grad((colors * normal(*colors.shape, seed=4)).sum(), [given, networks.weights])
+
+    several = results()
+    torch.set_num_threads(1)
+    assert all(a.equal(b) for a, b in zip(several, results(), strict=True))

@@ -31,11 +31,21 @@ struct Factor {
     static Factor columns(const Matrix& m) { return {m.row(0), 1, m.stride}; }
 };
 
-// C += A B for `R` rows and `C` vectors of C, from (row, column) on; sums over K.
-template <int R, int C> void add_tile(Factor a, const Matrix& b, int64_t K, Matrix& c, int64_t row, int64_t column) {
+// What a product is added to: as many rows, or the same one for all.
+struct Start {
+    const float* numbers;
+    int64_t stride;
+
+    static Start rows(const Matrix& m) { return {m.row(0), m.stride}; }
+    static Start one(const Matrix& m) { return {m.row(0), 0}; }
+};
+
+// C = start + A B for `R` rows and `C` vectors of C, from (row, column) on; sums over K.
+template <int R, int C>
+void fill_tile(Start start, Factor a, const Matrix& b, int64_t K, Matrix& c, int64_t row, int64_t column) {
     Lanes sums[R][C];
     for (int r = 0; r < R; r++)
-        for (int v = 0; v < C; v++) sums[r][v] = load(c.row(row + r) + column + v * WIDTH);
+        for (int v = 0; v < C; v++) sums[r][v] = load(start.numbers + (row + r) * start.stride + column + v * WIDTH);
     const float* left = a.numbers + row * a.stride;
     const float* right = b.row(0) + column;
     for (int64_t k = 0; k < K; k++, left += a.step, right += b.stride) {
@@ -48,34 +58,39 @@ template <int R, int C> void add_tile(Factor a, const Matrix& b, int64_t K, Matr
         for (int v = 0; v < C; v++) store(c.row(row + r) + column + v * WIDTH, sums[r][v]);
 }
 
-template <int R> void add_rows(Factor a, const Matrix& b, int64_t K, Matrix& c, int64_t row) {
+template <int R> void fill_rows(Start start, Factor a, const Matrix& b, int64_t K, Matrix& c, int64_t row) {
     int64_t column = 0;
-    for (; column + WIDE * WIDTH <= c.stride; column += WIDE * WIDTH) add_tile<R, WIDE>(a, b, K, c, row, column);
-    for (; column < c.stride; column += WIDTH) add_tile<R, 1>(a, b, K, c, row, column);
+    for (; column + WIDE * WIDTH <= c.stride; column += WIDE * WIDTH) fill_tile<R, WIDE>(start, a, b, K, c, row, column);
+    for (; column < c.stride; column += WIDTH) fill_tile<R, 1>(start, a, b, K, c, row, column);
 }
 
-// C[:M] += A B, sums over K.
-void add_product(Factor a, const Matrix& b, int64_t K, Matrix& c, int64_t M) {
+// C[:M] = start + A B, sums over K.
+void fill(Start start, Factor a, const Matrix& b, int64_t K, Matrix& c, int64_t M) {
     int64_t row = 0;
-    for (; row + TALL <= M; row += TALL) add_rows<TALL>(a, b, K, c, row);
-    for (; row < M; row++) add_rows<1>(a, b, K, c, row);
+    for (; row + TALL <= M; row += TALL) fill_rows<TALL>(start, a, b, K, c, row);
+    for (; row < M; row++) fill_rows<1>(start, a, b, K, c, row);
 }
 
 // A layer's weights, as they are and transposed, and biases.
 struct Layer {
-    Matrix weights, transposed;
-    const float* biases;
+    Matrix weights, transposed, biases;
+    const Matrix zeros;
 
     // Reads them from `from`, which goes on behind them.
-    Layer(const float*& from, int64_t outputs, int64_t inputs) : weights(outputs, inputs), transposed(inputs, outputs) {
+    Layer(const float*& from, int64_t outputs, int64_t inputs)
+        : weights(outputs, inputs), transposed(inputs, outputs), biases(1, outputs), zeros(1, inputs) {
         for (int64_t o = 0; o < outputs; o++)
             for (int64_t i = 0; i < inputs; i++) weights.row(o)[i] = transposed.row(i)[o] = *from++;
-        biases = from, from += outputs;
+        std::copy_n(from, outputs, biases.row(0)), from += outputs;
     }
 
-    void apply(const Matrix& inputs, int64_t count, Matrix& to) const {
-        for (int64_t n = 0; n < count; n++) std::copy_n(biases, to.columns, to.row(n));
-        add_product(Factor::rows(inputs), transposed, weights.columns, to, count);
+    void apply(Factor inputs, int64_t count, Matrix& to) const {
+        fill(Start::one(biases), inputs, transposed, weights.columns, to, count);
+    }
+
+    // Gradient of the inputs.
+    void back(const Matrix& gradient, int64_t count, Matrix& to) const {
+        fill(Start::one(zeros), Factor::rows(gradient), weights, weights.rows, to, count);
     }
 };
 
@@ -86,7 +101,7 @@ struct Slopes {
     explicit Slopes(const Layer& of) : weights(of.weights.rows, of.weights.columns), biases(1, of.weights.rows) {}
 
     void add(const Matrix& inputs, const Matrix& gradient, int64_t count) {
-        add_product(Factor::columns(gradient), inputs, count, weights, weights.rows);
+        fill(Start::rows(weights), Factor::columns(gradient), inputs, count, weights, weights.rows);
         for (int64_t n = 0; n < count; n++)
             for (int64_t o = 0; o < biases.columns; o++) biases.row(0)[o] += gradient.row(n)[o];
     }
@@ -108,21 +123,18 @@ void mask(Matrix& gradient, const Matrix& hidden, int64_t count) {
         store(gradient.row(0) + i, pick(load(hidden.row(0) + i) > 0.0f, load(gradient.row(0) + i), Lanes{}));
 }
 
-void clear(Matrix& m) { std::fill(m.numbers.begin(), m.numbers.end(), 0.0f); }
-
 struct Network {
     const Layer first, second, last;
-    Matrix inputs, one, two, outputs; // of a block of rows
+    Matrix one, two, outputs; // of a block of rows
 
     Network(const float* weights, int64_t width, int64_t channels)
         : first(weights, width, channels), second(weights, width, width), last(weights, OUTPUTS, width),
-          inputs(BLOCK, channels), one(BLOCK, width), two(BLOCK, width), outputs(BLOCK, OUTPUTS) {}
+          one(BLOCK, width), two(BLOCK, width), outputs(BLOCK, OUTPUTS) {}
 
-    void run(const float* from, int64_t count) {
-        for (int64_t n = 0; n < count; n++) std::copy_n(from + n * inputs.columns, inputs.columns, inputs.row(n));
-        first.apply(inputs, count, one), rectify(one, count);
-        second.apply(one, count, two), rectify(two, count);
-        last.apply(two, count, outputs);
+    void run(const float* inputs, int64_t count) {
+        first.apply({inputs, first.weights.columns, 1}, count, one), rectify(one, count);
+        second.apply(Factor::rows(one), count, two), rectify(two, count);
+        last.apply(Factor::rows(two), count, outputs);
     }
 };
 
@@ -141,27 +153,30 @@ void mmpi_network_back(int64_t begin, int64_t end, const float* weights, const f
                        int64_t rows, int64_t size, int64_t width, int64_t channels, float* grad_inputs,
                        float* grad_weights) {
     Network network(weights, width, channels);
-    Matrix at_outputs(BLOCK, OUTPUTS), at_two(BLOCK, width), at_one(BLOCK, width), at_inputs(BLOCK, channels);
+    const Layer &first = network.first, &second = network.second, &last = network.last;
+    Matrix given(BLOCK, channels), at_outputs(BLOCK, OUTPUTS), at_two(BLOCK, width), at_one(BLOCK, width),
+        at_inputs(BLOCK, channels);
     const int64_t parameters = width * (channels + 1 + width + 1 + OUTPUTS) + OUTPUTS;
     for (int64_t chunk = begin; chunk < end; chunk++) {
-        Slopes first(network.first), second(network.second), last(network.last);
+        Slopes of_first(first), of_second(second), of_last(last);
         const int64_t until = std::min(rows, (chunk + 1) * size);
         for (int64_t row = chunk * size; row < until; row += BLOCK) {
             const int64_t count = std::min(BLOCK, until - row);
             network.run(inputs + row * channels, count);
-            for (int64_t n = 0; n < count; n++)
+            for (int64_t n = 0; n < count; n++) {
+                std::copy_n(inputs + (row + n) * channels, channels, given.row(n));
                 std::copy_n(grad_outputs + (row + n) * OUTPUTS, OUTPUTS, at_outputs.row(n));
-            last.add(network.two, at_outputs, count);
-            clear(at_two), add_product(Factor::rows(at_outputs), network.last.weights, OUTPUTS, at_two, count);
-            mask(at_two, network.two, count), second.add(network.one, at_two, count);
-            clear(at_one), add_product(Factor::rows(at_two), network.second.weights, width, at_one, count);
-            mask(at_one, network.one, count), first.add(network.inputs, at_one, count);
-            clear(at_inputs), add_product(Factor::rows(at_one), network.first.weights, width, at_inputs, count);
+            }
+            of_last.add(network.two, at_outputs, count), last.back(at_outputs, count, at_two);
+            mask(at_two, network.two, count);
+            of_second.add(network.one, at_two, count), second.back(at_two, count, at_one);
+            mask(at_one, network.one, count);
+            of_first.add(given, at_one, count), first.back(at_one, count, at_inputs);
             for (int64_t n = 0; n < count; n++)
                 std::copy_n(at_inputs.row(n), channels, grad_inputs + (row + n) * channels);
         }
         float* to = grad_weights + chunk * parameters;
-        first.write(to), second.write(to), last.write(to);
+        of_first.write(to), of_second.write(to), of_last.write(to);
     }
 }
 
