@@ -121,26 +121,23 @@ inline Lanes minus_log_rest(Lanes x) {
     return 2.0f * z * p;
 }
 
+// Shares of heads by their votes.
 class Blending {
   public:
     explicit Blending(const Scene& scene) : scene(scene), values(scene.num_heads), votes(scene.num_heads) {}
 
-    // Optical depths after blending of samples of heads `own`; local(j) are their rays in the axes of MPI j.
+    // Optical depths after blending of samples of head `own`; local(j) are their rays in the axes of MPI j.
     template <typename Local>
-    Lanes blended(const Packet& rays, const Local& local, IntLanes own, Lanes inverse_t, Lanes tau, Mask going) {
+    Lanes blended(const Packet& rays, const Local& local, int64_t own, Lanes inverse_t, Lanes tau, Mask going) {
         const Mask asked = going & (tau > NEGLIGIBLE);
-        const Lanes lowest = splat(-std::numeric_limits<float>::infinity());
-        Lanes own_vote{}, highest = lowest, others{};
         if (!any(asked)) return tau / float(scene.num_heads);
         count(rays, local, own, inverse_t, asked);
-        for (int64_t j = 0; j < scene.num_heads; j++) {
-            const Mask is_own = own == int32_t(j);
-            own_vote = pick(is_own, values[j], own_vote), values[j] = pick(is_own, lowest, values[j]);
-            highest = most(highest, values[j]);
-        }
+        const Lanes own_vote = values[own], lowest = splat(LOWEST);
+        values[own] = lowest;
+        Lanes highest = lowest, others{};
+        for (const Lanes& value : values) highest = most(highest, value);
         const Mask shared = asked & (highest > lowest); // the others are the sole cover
-        for (int64_t j = 0; j < scene.num_heads; j++)
-            others += pick(values[j] > lowest, exp_lanes(values[j] - highest), Lanes{});
+        for (const Lanes& value : values) others += pick(value > lowest, exp_lanes(value - highest), Lanes{});
         // With the others' share over its own, w: P = 1 / (1 + w), and 1 - alpha' = (w + e^-tau) / (1 + w).
         const Lanes ratio = others * exp_lanes(highest - own_vote), alpha = absorbed(tau) / (1.0f + ratio);
         Lanes depth = minus_log_rest(alpha);
@@ -153,19 +150,20 @@ class Blending {
     }
 
   private:
+    static constexpr float LOWEST = -std::numeric_limits<float>::infinity();
     const Scene& scene;
-    std::vector<Lanes> values; // of each head's vote; -inf where it has none
+    std::vector<Lanes> values; // of each head's vote; the lowest where it has none
     std::vector<Votes> votes;
 
     template <typename Local>
-    void count(const Packet& rays, const Local& local, IntLanes own, Lanes inverse_t, Mask asked) {
+    void count(const Packet& rays, const Local& local, int64_t own, Lanes inverse_t, Mask asked) {
         for (int64_t j = 0; j < scene.num_heads; j++) {
             const LocalRays* axes = j < scene.num_mpis ? &local(j) : nullptr;
-            votes[j].place(scene.grids[j], Places(scene, rays, axes, j, inverse_t), own == int32_t(j), asked);
+            votes[j].place(scene.grids[j], Places(scene, rays, axes, j, inverse_t), whole(-(j == own)), asked);
         }
         for (Votes& vote : votes) vote.look_up(scene);
         for (int64_t j = 0; j < scene.num_heads; j++) {
-            values[j] = splat(-std::numeric_limits<float>::infinity());
+            values[j] = splat(LOWEST);
             votes[j].each(scene, [&](int i, const Sample& texels) {
                 float sum = 0;
                 for (int tap = 0; tap < texels.taps; tap++) sum += texels.shares[tap] * scene.reliability[texels.rows[tap]];

@@ -246,7 +246,7 @@ template <typename Texels> class Walker {
                                             : texels.tau(h, walks[h], going, at);
             if (texels.blends) {
                 const auto axes = [&](int64_t k) -> const LocalRays& { return crossings.mpis[k]; };
-                tau = blending.blended(packet, axes, whole(h), inverse_t, tau, going);
+                tau = blending.blended(packet, axes, h, inverse_t, tau, going);
             }
             through = exp_lanes(-tau);
         } else {

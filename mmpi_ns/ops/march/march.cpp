@@ -192,7 +192,7 @@ class Training {
     void blend(Run& run, int64_t head) {
         for (int j = run.size; j < WIDTH; j++) run.inverse_t[j] = 0;
         const auto axes = [&](int64_t k) -> const LocalRays& { return local[k]; };
-        const Lanes tau = blending.blended(same, axes, whole(int32_t(head)), load(run.inverse_t), load(run.tau),
+        const Lanes tau = blending.blended(same, axes, head, load(run.inverse_t), load(run.tau),
                                            IOTA < float(run.size));
         store(run.tau, tau), store(run.pass, exp_lanes(-tau));
     }
