@@ -17,7 +17,7 @@ from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
-AT_LEAST = 1 << 15
+AT_LEAST = 1 << 13
 """Entries, samples or bricks that justify another thread, whose start takes a tenth of a millisecond."""
 
 

@@ -44,27 +44,37 @@ void finish(Run& run, float interval) {
     store(run.pass, exp_lanes(-tau));
 }
 
+// The next planes of an MPI that a ray intersects, and where.
+struct Block {
+    int count;
+    int64_t first; // plane
+    Lanes w, x, y; // disparities and NDC
+    PlaneCells cells;
+
+    Block(const Run& run, const Mpi& mpi, const Grid& grid, const Crossing& at, int ray, int most)
+        : count(int(std::min<int64_t>(most, run.count - run.begin))), first(grid.depth - 1 - run.first + run.begin),
+          w((float(run.first - run.begin) - IOTA) * mpi.step + mpi.end),
+          x((at.u[ray] + w * at.u_slope[ray] - mpi.u0) * mpi.u_scale - 1.0f),
+          y((at.v[ray] + w * at.v_slope[ray] - mpi.v0) * mpi.v_scale - 1.0f),
+          cells(grid, x, y, truncated(IOTA) + int32_t(first)) {}
+};
+
 // The next samples of an MPI. With `skips`, samples without a stored texel, which are transparent, are skipped.
 void fill_mpi(Run& run, const Scene& scene, const Crossing& at, int ray, int64_t k, bool skips) {
     const Mpi& mpi = scene.mpis[k];
     const Grid& grid = scene.grids[k];
-    const float u = at.u[ray], u_slope = at.u_slope[ray], v = at.v[ray], v_slope = at.v_slope[ray];
     const float oz = at.origin[2][ray], dz = at.direction[2][ray];
     const float *biases = scene.biases + grid.bias, *table = scene.density;
     const int32_t* tiles = grid.tiles + grid.first_tile;
     int size = 0;
     while (2 * size < WIDTH && run.begin < run.count) {
-        const int count = int(std::min<int64_t>(WIDTH - size, run.count - run.begin));
-        const int64_t m = run.first - run.begin, first = grid.depth - 1 - m;
-        const Lanes w = (float(m) - IOTA) * mpi.step + mpi.end;
-        const Lanes x = (u + w * u_slope - mpi.u0) * mpi.u_scale - 1.0f, y = (v + w * v_slope - mpi.v0) * mpi.v_scale - 1.0f;
+        const Block block(run, mpi, grid, at, ray, WIDTH - size);
+        const PlaneCells& cells = block.cells;
         float ndc[3][WIDTH], inverse_t[WIDTH];
-        store(ndc[0], x), store(ndc[1], y), store(ndc[2], 1.0f - mpi.s_scale * (w - mpi.end));
-        store(inverse_t, w * dz / (1.0f - w * oz));
-        const PlaneCells cells(grid, x, y, truncated(IOTA) + int32_t(first));
-        for (int j = 0; j < count; j++) __builtin_prefetch(tiles + cells.tile[j]);
-        for (int j = 0; j < count; j++) __builtin_prefetch(table + tiles[cells.tile[j]] * BRICK + cells.texel[j]);
-        for (int j = 0; j < count; j++) {
+        store(ndc[0], block.x), store(ndc[1], block.y), store(ndc[2], 1.0f - mpi.s_scale * (block.w - mpi.end));
+        store(inverse_t, block.w * dz / (1.0f - block.w * oz));
+        for (int j = 0; j < block.count; j++) {
+            const int64_t plane = block.first + j;
             float corners[4];
             if (!cells.edge[j]) {
                 const int32_t brick = tiles[cells.tile[j]];
@@ -72,22 +82,26 @@ void fill_mpi(Run& run, const Scene& scene, const Crossing& at, int ray, int64_t
                 const float* texel = table + int64_t(brick) * BRICK + cells.texel[j];
                 corners[0] = texel[0], corners[1] = texel[1], corners[2] = texel[8], corners[3] = texel[9];
             } else {
-                const Corners around(grid, first + j, cells.line[j], cells.column[j]);
+                const Corners around(grid, plane, cells.line[j], cells.column[j]);
                 if (skips && !around.stored) continue;
                 for (int a = 0; a < 4; a++) corners[a] = table[around.row[a]];
             }
             const float fx = cells.fx[j], fy = cells.fy[j], gx = 1 - fx, gy = 1 - fy;
             run.tau[size] = gx * gy * corners[0] + fx * gy * corners[1] + gx * fy * corners[2] + fx * fy * corners[3] +
-                            biases[first + j];
-            run.plane[size] = int32_t(first + j);
+                            biases[plane];
+            run.plane[size] = int32_t(plane);
             for (int a = 0; a < 3; a++) run.ndc[size][a] = ndc[a][j];
             run.inverse_t[size] = inverse_t[j];
             size++;
         }
-        run.begin += count;
+        run.begin += block.count;
     }
     run.size = size;
     finish(run, mpi.interval);
+    if (run.begin == run.count) return;
+    const Block next(run, mpi, grid, at, ray, WIDTH);
+    for (int j = 0; j < next.count; j++)
+        __builtin_prefetch(table + int64_t(tiles[next.cells.tile[j]]) * BRICK + next.cells.texel[j]);
 }
 
 void fill_cube(Run& run, const Scene& scene, const Packet& rays, int ray, bool skips) {
