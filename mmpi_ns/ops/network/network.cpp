@@ -12,7 +12,7 @@ constexpr int TALL = 6, WIDE = NATIVE == WIDTH ? 4 : 1; // of a tile, whose sums
 
 // A matrix whose rows are `stride` numbers apart; columns are padded to whole vectors.
 struct Matrix {
-    int64_t rows = 0, columns = 0, stride = 0;
+    int64_t rows, columns, stride;
     std::vector<float> numbers;
 
     Matrix(int64_t rows, int64_t columns)
