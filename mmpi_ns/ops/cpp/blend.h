@@ -89,7 +89,7 @@ class Votes {
     void look_up(const Scene& scene) {
         for (uint32_t left = lanes; left; left &= left - 1) {
             const int i = __builtin_ctz(left);
-            texels[i] = Sample();
+            texels[i].taps = 0;
             texels[i].put(*grid, {lower[2][i], fraction[2][i]}, {lower[1][i], fraction[1][i]},
                           {lower[0][i], fraction[0][i]});
             __builtin_prefetch(scene.touched + texels[i].rows[nearest[i]]);

@@ -59,6 +59,12 @@ void mmpi_weighted_rows(int64_t begin, int64_t end, const float* numbers, const 
     const int64_t ahead = AHEAD / taps;
     for (int64_t n = begin; n < end; n++) {
         for (int64_t i = (n + ahead) * taps; n + ahead < end && i < (n + ahead + 1) * taps; i++) table.prefetch(positions[i]);
+        if (channels == 1) { // densities, reliabilities
+            float sum = 0;
+            for (int64_t i = n * taps; i < (n + 1) * taps; i++) sum += weights[i] * numbers[positions[i]];
+            values[n] = sum;
+            continue;
+        }
         for (int64_t first = 0; first < channels; first += WIDTH) {
             Lanes sum{};
             for (int64_t i = n * taps; i < (n + 1) * taps; i++)

@@ -4,6 +4,8 @@
 
 namespace {
 
+constexpr int64_t TAPS = 8; // of a vote
+
 // Votes on samples [begin, end), from begin * heads on; their number goes to the part's place in `counts`.
 void mmpi_find_votes(int64_t begin, int64_t end, const Scene* scene, const float* origins, const float* directions,
                      const float* inverse_t, const int64_t* heads, int64_t* numbers, int64_t* rows, float* weights,
@@ -24,8 +26,8 @@ void mmpi_find_votes(int64_t begin, int64_t end, const Scene* scene, const float
         for (int64_t j = 0; j < H; j++)
             votes[j].each(*scene, [&](int i, const Sample& texels) {
                 numbers[size] = (first + i) * H + j;
-                std::copy_n(texels.rows, texels.taps, rows + size * texels.taps);
-                std::copy_n(texels.shares, texels.taps, weights + size++ * texels.taps);
+                std::copy_n(texels.rows, TAPS, rows + size * TAPS);
+                std::copy_n(texels.shares, TAPS, weights + size++ * TAPS);
             });
     }
     counts[this_part] = size - begin * H;
