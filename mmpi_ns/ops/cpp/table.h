@@ -23,6 +23,11 @@ inline Octet load_octet(const float* from) {
 
 inline Lanes join(Octet a, Octet b) {
     Lanes x;
+#ifdef __AVX512F__ // by way of memory, the load would wait for both stores
+    const __m512d lower = _mm512_castpd256_pd512(__m256d(a));
+    x.pieces[0] = FloatPiece(_mm512_insertf64x4(lower, __m256d(b), 1));
+    return x;
+#endif
     __builtin_memcpy(x.pieces, &a, sizeof a), __builtin_memcpy(reinterpret_cast<char*>(x.pieces) + sizeof a, &b, sizeof b);
     return x;
 }
