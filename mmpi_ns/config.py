@@ -29,6 +29,7 @@ from mmpi_priors.settings import CapturePriorsConfig
 PAPER_DATA = {
     "keypoint_rays": 0,
     "new_view_share": 0.0,
+    "pixel_jitter": 0.0,
     "priors": CapturePriorsConfig(dense_depth=False, depth_images=False, mask_moving=False, correct_exposure=False),
 }
 """The paper trains on the colours of pixels alone; point clouds are not read either."""

@@ -71,6 +71,9 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     new_view_share: float = 0.75
     """Rays of new views for each pixel ray: from between two training cameras to points that both see at the same
     depth (0: none)."""
+    pixel_jitter: float = 0.29
+    """Standard deviation of rays from their pixels' centres along both axes, in pixels (0: through the centres). Fields
+    that see a pixel often do not learn its noise, so longer runs lose less."""
     resident_pixels: float = 60e6
     """Training pixels held in memory at once (at most 12 bytes each). Longer captures are read window by window; if a
     window has more pixels, a random subset of this size is used. 0: window by window, all of them."""
@@ -203,7 +206,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         new_views = None if find is None or config.new_view_share == 0 else find(images, self.device, exposures)
         keypoints = None if self.priors is None else rays_to_keypoints(self.observations, self.device, images)
         counts, rays = (config.new_view_share, config.keypoint_rays), self.train_ray_generator
-        return RaySources(pixels, new_views, keypoints, rays, *counts, exposures)
+        return RaySources(pixels, new_views, keypoints, rays, *counts, exposures, config.pixel_jitter)
 
     def describe(self) -> str:
         """Size of the capture in images, points and depths, in one line."""
