@@ -206,9 +206,11 @@ def _read_lines(path: Path, photos: Sequence[Photo]) -> GivenPoses:
         if rows != len(photos):
             digits = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
             places = [int(d[-1]) for d in digits if d]
-            if rows < len(photos) or len(set(places)) < len(photos) or max(places) >= rows:
+            first = int(bool(places) and max(places) == rows)
+            places = [place - first for place in places]
+            if len(set(places)) < len(photos) or not 0 <= min(places) <= max(places) < rows:
                 raise InputError(f"{path} has {rows} poses for {len(photos)} images: they cannot be matched.")
-            summary = "the lines that the images' numbers name (from 0)"
+            summary = f"the lines that the images' numbers name (from {first})"
         return GivenPoses({p.name: poses[i] for p, i in zip(photos, places, strict=True)}, f"KITTI poses, {summary}")
     for pose, row in zip(poses, numbers, strict=True):
         pose[:3, :3] = pycolmap.Rotation3d(row[4:8]).matrix() if np.linalg.norm(row[4:8]) > 0 else np.nan
@@ -250,6 +252,7 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> GivenPoses:
         poses, intrinsics = {}, {}
         for photo in (p for p in photos if p.name in places):
             frame = frames[places[photo.name]] | meta  # as in nerfstudio, a value for all overrides that of a frame
+            frame |= zip(("k1", "k2", "k3", "k4", "p1", "p2"), frame.get("distortion_params", ()), strict=False)
             poses[photo.name] = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
             if "fl_x" in frame:  # for images that may be smaller or larger than those of the file
                 fisheye = frame.get("camera_model") in FISHEYE
@@ -263,6 +266,8 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> GivenPoses:
                 cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
                 values = (fx * sx, fy * sy, cx * sx, cy * sy, *(float(frame.get(k, 0.0)) for k in keys))
                 intrinsics[photo.name] = opencv_camera(values, fisheye)
+        if intrinsics and (without := [name for name in poses if name not in intrinsics]):
+            raise InputError(f"{path} gives {without[0]} no fl_x, as it gives other images.")
         lists, named = ("train_filenames", "test_filenames"), {files[n]: name for name, n in places.items()}
         is_split = all(key in meta for key in lists)
         split = {key: [named.get(Path(f), f) for f in meta[key]] for key in lists} if is_split else None

@@ -77,10 +77,14 @@ def test_map_coordinates_get_an_origin_among_the_cameras(scale, tmp_path):
     assert np.abs(places).max() < 2 * np.ptp(places, axis=0).max()
 
 
-def test_kitti_lines_are_chosen_by_the_images_numbers_where_there_are_more(tmp_path):
+@pytest.mark.parametrize(("numbers", "first"), [((3, 10, 25), 0), ((3, 10, 30), 1)])
+def test_kitti_lines_are_chosen_by_the_images_numbers_where_there_are_more(numbers, first, tmp_path):
     path = write_kitti(tmp_path / "poses.txt", corridor.poses(30))
-    photos = [Photo(f"{n:06d}.png", 9, 9, source=f"{n:06d}.png") for n in (3, 10, 25)]
-    assert read(path, photos=photos)[1] == pytest.approx(corridor.poses(30)[[3, 10, 25]], abs=1e-9)
+    photos = [Photo(f"{n:06d}.png", 9, 9, source=f"{n:06d}.png") for n in numbers]
+    wanted = corridor.poses(30)[[n - first for n in numbers]]
+    assert read(path, photos=photos)[1] == pytest.approx(wanted, abs=1e-9)
+    with pytest.raises(InputError, match="cannot be matched"):
+        read(path, photos=[replace(photo, source=f"{30 + n}.png") for n, photo in enumerate(photos)])
 
 
 def test_tum_poses_are_matched_by_time_stamp(tmp_path):
@@ -121,6 +125,12 @@ def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_pa
     meta = json.loads(write_transforms(path, GIVEN).read_text())
     path.write_text(json.dumps(meta | {"frames": [f | {"fl_x": 999.0} for f in meta["frames"]]}))
     assert read(path)[0].intrinsics["frame_001.png"].params[0] == 170.0  # nerfstudio reads the one for all
+    known, _ = read(write_transforms(path, GIVEN, distortion_params=[0.1, 0.2, 0.5, 0.0, 0.3, 0.4]))
+    assert opencv_intrinsics(known.intrinsics["frame_001.png"])[0][4:] == [0.1, 0.2, 0.3, 0.4, 0.5]
+    some = [f | {"fl_x": 999.0} for f in meta["frames"][:3]] + meta["frames"][3:]
+    path.write_text(json.dumps({"frames": some}))
+    with pytest.raises(InputError, match="no fl_x, as"):
+        read(path)
 
 
 @pytest.mark.parametrize(
