@@ -22,7 +22,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import Capacity, MarchOptions
 from mmpi_ns.placement.defaults import steps_for
-from mmpi_ns.placement.split import most_pixels, place_windows
+from mmpi_ns.placement.split import find_balls, most_pixels, place_windows
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows, square_by_square
 from mmpi_ns.rendering.metrics import ImageMetrics, pictures, psnr_and_ssim
@@ -106,7 +106,8 @@ class MMPIModel(Model):
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             given = WindowedPlan.load(config.plan_file)
         if observations is not None and config.total_steps == 0:
-            config.total_steps = steps_for(most_pixels(observations, placement, given), config.size, config.rays_times)
+            windows = find_balls(observations, placement.window_length) if given is None else given.windows
+            config.total_steps = steps_for(most_pixels(observations, windows), config.size, config.rays_times)
         if given is not None:
             return given
         if capture is None or observations is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -72,8 +73,8 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """Rays of new views for each pixel ray: from between two training cameras to points that both see at the same
     depth (0: none)."""
     pixel_jitter: float = 0.29
-    """Standard deviation of rays from their pixels' centres along both axes, in pixels (0: through the centres). Fields
-    that see a pixel often do not learn its noise, so longer runs lose less."""
+    """Standard deviation of rays from the centres of pixels along both axes, in pixels, in the steps beyond those that
+    --pipeline.model.size can give (0: always through the centres). So longer runs learn less of the images' noise."""
     resident_pixels: float = 60e6
     """Training pixels held in memory at once (at most 12 bytes each). Longer captures are read window by window; if a
     window has more pixels, a random subset of this size is used. 0: window by window, all of them."""
@@ -98,6 +99,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """The sources of all cameras, if they are in memory all the time."""
         self._drawn: tuple[RaySources, tuple[int, int], Batch] | None = None
         """Rays of some steps with their sources, number of rays and number of the steps."""
+        self.jitter_from = math.inf
+        """Step from which on pixel rays are jittered."""
         self._is_replayed = False
         self._place, self._place_read = 0, torch.zeros(1, dtype=torch.int64, device=kwargs.get("device", "cpu"))
         """Place of the step among them, and what recorded steps read of it."""
@@ -206,7 +209,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         new_views = None if find is None or config.new_view_share == 0 else find(images, self.device, exposures)
         keypoints = None if self.priors is None else rays_to_keypoints(self.observations, self.device, images)
         counts, rays = (config.new_view_share, config.keypoint_rays), self.train_ray_generator
-        return RaySources(pixels, new_views, keypoints, rays, *counts, exposures, config.pixel_jitter)
+        return RaySources(pixels, new_views, keypoints, rays, *counts, exposures)
 
     def describe(self) -> str:
         """Size of the capture in images, points and depths, in one line."""
@@ -261,7 +264,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         held = self._drawn if self._drawn is not None and self._drawn[0] is sources else None
         if held is None or held[1] != (pixel_rays, number):
             steps = range(number * AT_ONCE, (number + 1) * AT_ONCE)
-            drawn = sources.draw(pixel_rays, *(generator(self.config.seed, i, "pixels", self.device) for i in steps))
+            jitter = self.config.pixel_jitter if steps.start >= self.jitter_from else 0.0
+            generators = (generator(self.config.seed, i, "pixels", self.device) for i in steps)
+            drawn = sources.draw(pixel_rays, *generators, jitter=jitter)
             if self._is_replayed and held is not None and held[1][0] == pixel_rays:
                 for old, new in zip(_tensors(held[2]), _tensors(drawn), strict=True):
                     old.copy_(new)

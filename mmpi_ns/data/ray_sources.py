@@ -159,8 +159,6 @@ class RaySources:
     """Keypoint rays of a step without new views."""
     exposures: Float[Tensor, "M 3"] | None = None
     """Colour in each training image over colour in the field; None if all have the same exposure."""
-    jitter: float = 0.0
-    """Standard deviation of pixel rays from their pixels' centres along both axes, in pixels."""
 
     def of_images(self, images: NDArray[np.int64]) -> RaySources:
         """The sources of some images. Raises InputError if masks leave them no pixel."""
@@ -189,10 +187,10 @@ class RaySources:
         return pixel_rays, new_view_rays, keypoint_rays
 
     def draw(
-        self, pixel_rays: int, *generators: torch.Generator, pixels_alone: bool = False
+        self, pixel_rays: int, *generators: torch.Generator, pixels_alone: bool = False, jitter: float = 0.0
     ) -> tuple[TrainingRays, dict[str, Tensor]]:
-        """Rays of pixels, new views and keypoints, in this order, or through the centres of pixels alone, and their
-        batch, for S steps with a generator each.
+        """Rays of pixels, new views and keypoints, in this order, or of pixels alone, and their batch, for S steps with
+        a generator each. ``jitter``: standard deviation of the rays of pixels from the centres, in pixels.
 
         Returns:
             The rays [S, R]. The batches: ``image``, colours of the rays of pixels and new views, at the exposure of the
@@ -203,10 +201,10 @@ class RaySources:
         if self.exposures is not None:
             colors[:, :3] /= self.exposures[indices[:, 0]]
         bundles, images, device = [self.rays(indices)], [colors], colors.device
-        if self.jitter and not pixels_alone:
+        if jitter:
             (pixels,) = bundles
             shifts = torch.cat([torch.randn(pixel_rays, 3, generator=g, device=g.device) for g in generators])
-            shifts = self.jitter * pixels.pixel_area.sqrt() * shifts.to(device)
+            shifts = jitter * pixels.pixel_area.sqrt() * shifts.to(device)
             pixels.directions = torch.nn.functional.normalize(pixels.directions + shifts, dim=-1)
         priors = [pad(depths, (1, 0))]  # of keypoints, and of other surfaces
         _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays)

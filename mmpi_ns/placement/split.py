@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,9 +40,8 @@ def place_windows(
     return WindowedPlan(tuple(replace(ball, plan=plan) for ball, plan in zip(balls, plans, strict=True)))
 
 
-def most_pixels(observations: Observations, config: PlacementConfig, given: WindowedPlan | None = None) -> float:
-    """Training pixels of the largest window of a given plan, or of the capture as it is split."""
-    windows = find_balls(observations, config.window_length) if given is None else given.windows
+def most_pixels(observations: Observations, windows: Sequence[Window]) -> float:
+    """Training pixels of the largest window; of the capture without any."""
     pixels = observations.sizes.prod(-1)
     cameras = (cameras_of(window, observations.centers) for window in windows)
     return float(max((pixels[some].sum() for some in cameras), default=pixels.sum()))

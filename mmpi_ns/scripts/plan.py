@@ -44,7 +44,7 @@ class PlanCommand:
     def main(self) -> None:
         # Slow imports, which --help does not need.
         from mmpi_ns.placement.show import draw_plan, explain
-        from mmpi_ns.placement.split import most_pixels, place_windows
+        from mmpi_ns.placement.split import find_balls, most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import make_writable, write_plan, write_text
 
@@ -57,7 +57,8 @@ class PlanCommand:
         windows = None if self.plan_file is None else WindowedPlan.load(self.plan_file)
         observations, manager = load_observations(self.scene, self.downscale_factor)
         if windows is None:
-            steps = steps_for(most_pixels(observations, self.placement), self.size)
+            balls = find_balls(observations, self.placement.window_length)
+            steps = steps_for(most_pixels(observations, balls), self.size)
             sized = replace(self.placement, max_texels=min(self.size, 1.0) * self.placement.max_texels)
             windows = place_windows(observations, sized, steps * RAYS)
         draw_plan(self.output / "plan.png", windows, observations)

@@ -26,7 +26,7 @@ RANGES = {
     "pipeline.datamanager": {
         "train_num_rays_per_batch": Number(1, 10**8, whole=True),
         "keypoint_rays": COUNT,
-        **dict.fromkeys(("new_view_share", "resident_pixels"), NOT_NEGATIVE),
+        **dict.fromkeys(("new_view_share", "pixel_jitter", "resident_pixels"), NOT_NEGATIVE),
         "camera_res_scale_factor": POSITIVE,
     },
     "pipeline.model": {"eval_num_rays_per_chunk": COUNT, "size": POSITIVE},

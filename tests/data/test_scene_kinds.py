@@ -142,7 +142,7 @@ def capture(request, tmp_path_factory):
 
 def test_every_pixel_drawn_has_the_colour_that_its_ray_meets(capture):
     kind, data, parser = capture
-    manager = datamanager(data, dataparser=parser, triangulate=False, pixel_jitter=0.0)
+    manager = datamanager(data, dataparser=parser, triangulate=False)
     rays, batch = manager.next_train(0)
     origins, directions = (x[:64].double().numpy() for x in (rays.origins, rays.directions))
     wanted = color_of(*in_capture_frame(manager, origins, directions))

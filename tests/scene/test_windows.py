@@ -49,10 +49,9 @@ def test_a_short_capture_is_one_window_and_its_plan_is_written_as_before():
 
 def test_steps_follow_the_pixels_of_the_largest_window():
     few, many = road(30), road(400)
-    one, windows = PlacementConfig(window_length=0.0), PlacementConfig(window_length=4.0)
-    assert most_pixels(few, one) == few.sizes.prod(-1).sum() == most_pixels(few, windows)
-    assert 0.05 < most_pixels(many, windows) / many.sizes.prod(-1).sum() < 0.5
-    assert most_pixels(many, windows, WindowedPlan.single(NO_PLAN)) == many.sizes.prod(-1).sum()
+    assert most_pixels(few, []) == few.sizes.prod(-1).sum() == most_pixels(few, find_balls(few, 4.0))
+    assert 0.05 < most_pixels(many, find_balls(many, 4.0)) / many.sizes.prod(-1).sum() < 0.5
+    assert most_pixels(many, WindowedPlan.single(NO_PLAN).windows) == many.sizes.prod(-1).sum()
     steps = [steps_for(pixels) for pixels in (1e4, 0.75 * FEW, FEW, MANY, 2 * MANY, 1e12)]
     assert steps == [2500, 3000, 4000, 4000, 8000, 12000]
     asked = ((FEW, 0.3), (MANY, 4.0), (2 * FEW, 4.0), (FEW, 4.0), (1e4, 4.0))  # the last three reach two rays a pixel

@@ -11,6 +11,8 @@ from training_runs import WINDOW_STEPS as STEPS
 from training_runs import compared, differences, facing, load, ready, rendered, trainer_config
 
 from mmpi_ns.field.tables import in_half_precision
+from mmpi_ns.placement.defaults import RAYS, steps_for
+from mmpi_ns.placement.split import most_pixels
 from mmpi_ns.scene.windows import WindowedPlan, window_shares
 from mmpi_ns.training.initial import start_from_depths
 from mmpi_ns.training.phases import Schedule
@@ -43,6 +45,12 @@ def test_a_window_draws_from_its_own_cameras_alone(whole):
     assert len(bundle) == 80 and beyond.max() < window.radius + window.margin
     centers = torch.from_numpy(manager.observations.centers)
     assert ((centers - torch.tensor(window.center)).norm(dim=-1) > window.radius + window.margin).any()
+
+
+def test_rays_are_jittered_beyond_the_longest_run_of_their_window_that_size_gives(whole):
+    manager, windows = whole.pipeline.datamanager, whole.pipeline.model.progress.windows.windows
+    rays = RAYS * steps_for(most_pixels(manager.observations, windows), 1e9)
+    assert manager.jitter_from == STEPS + rays / manager.config.train_num_rays_per_batch > STEPS + 2000
 
 
 def test_a_finished_window_is_the_model_of_the_checkpoint_at_its_end(whole):
