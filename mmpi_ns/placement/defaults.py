@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from mmpi_ns.scene.plan import MOST_PLANES, MOST_TEXELS, MOST_VOXELS
 from mmpi_ns.settings import PlacementConfig
 from mmpi_ns.utils.errors import InputError
@@ -58,11 +56,6 @@ def steps_for(pixels: float, size: float = 1.0, times: int = 1) -> int:
     most = RAYS_PER_PIXEL * pixels / RAYS
     steps = min(multiple * steps, most if most >= LEAST_TIMES * steps else steps)
     return 100 * max(1, round(steps / 100)) // times
-
-
-def most_rays(pixels: float) -> float:
-    """Pixel rays of the longest run of a window that ``size`` gives, by its training pixels."""
-    return RAYS * steps_for(pixels, math.inf)
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:

@@ -20,7 +20,7 @@ from torch.nn import Parameter
 from mmpi_ns.data.datamanager import MMPIDataManager
 from mmpi_ns.data.rays import TrainingRays
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.placement.defaults import most_rays
+from mmpi_ns.placement.defaults import RAYS, steps_for
 from mmpi_ns.placement.split import cameras_of, most_pixels
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -171,8 +171,9 @@ class TrainingRun:
                 centers, windows = manager.observations.centers, progress.windows.windows
                 cameras = cameras_of(windows[window], centers) if len(windows) > 1 else None
                 manager.use_cameras(cameras)
-                rays = most_rays(most_pixels(manager.observations, windows)) / manager.config.train_num_rays_per_batch
-                manager.jitter_from = window * schedule.window_steps + rays
+                rays = RAYS * steps_for(most_pixels(manager.observations, windows))
+                first = window * schedule.window_steps
+                manager.jitter_from = first + rays / manager.config.train_num_rays_per_batch
                 self._drawn_from = window
                 if step == window * schedule.window_steps and manager.sources is not None:
                     start_from_depths(field, manager.sources, manager.config.seed)

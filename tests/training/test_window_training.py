@@ -47,9 +47,9 @@ def test_a_window_draws_from_its_own_cameras_alone(whole):
     assert ((centers - torch.tensor(window.center)).norm(dim=-1) > window.radius + window.margin).any()
 
 
-def test_rays_are_jittered_beyond_the_longest_run_of_their_window_that_size_gives(whole):
+def test_rays_are_jittered_beyond_as_many_as_a_window_takes_by_default(whole):
     manager, windows = whole.pipeline.datamanager, whole.pipeline.model.progress.windows.windows
-    rays = RAYS * steps_for(most_pixels(manager.observations, windows), 1e9)
+    rays = RAYS * steps_for(most_pixels(manager.observations, windows))
     assert manager.jitter_from == STEPS + rays / manager.config.train_num_rays_per_batch > STEPS + 2000
 
 
