@@ -1,4 +1,5 @@
-"""Milliseconds of the steps of a trained run on a CPU, with several numbers of threads in turn.
+"""Milliseconds of the steps of a trained run, and of an image without details, on a CPU, with several numbers of
+threads in turn.
 
 python benchmarks/steps.py mmpi --data CAPTURE --load-dir RUN/nerfstudio_models --steps 2500 --at 1400
 python benchmarks/steps.py mmpi-kitti --data CAPTURE --load-dir RUN/nerfstudio_models --steps 2500 --at 2440 --rays 4096
@@ -48,7 +49,10 @@ def main() -> None:
                     steps.run(FIRST)
                     found.append(1e3 * steps.run(COUNT) / COUNT)
     for threads, found in times.items():
-        print(f"{threads} thread(s): {median(found):.1f} ms a step ({min(found):.1f} to {max(found):.1f})")
+        torch.set_num_threads(threads)
+        frame = median(1e3 * steps.render()[0] for _ in range(ROUNDS * FIRST))
+        step = f"{median(found):.1f} ms a step ({min(found):.1f} to {max(found):.1f})"
+        print(f"{threads} thread(s): {step}, {frame:.1f} an image")
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     depth (0: none)."""
     pixel_jitter: float = 0.29
     """Standard deviation of rays from the centres of pixels along both axes, in pixels, beyond as many rays as a run
-    takes by default (0: always through the centres). So longer runs learn less of the images' noise."""
+    takes by default on a CPU (0: always through the centres). So longer runs learn less of the images' noise."""
     resident_pixels: float = 60e6
     """Training pixels held in memory at once (at most 12 bytes each). Longer captures are read window by window; if a
     window has more pixels, a random subset of this size is used. 0: window by window, all of them."""

@@ -101,6 +101,7 @@ def test_the_papers_methods_keep_its_settings(method):
     assert (model.schedule.decay_decades, model.schedule.decay_from) == (1.5, 0.0)
     assert model.colour.feature_channels == 9 and optimizers["colour"]["optimizer"].lr == 1e-3
     assert (model.loss.tv_density, model.loss.tv_features) == (1e-5, 1e-6)
+    assert method.config.pipeline.datamanager.pixel_jitter == 0.0
     assert mmpi.config.pipeline.model.loss.tv_density == 1e-4, "a change of one must not reach another"
     if method is mmpi_kitti:
         assert (model.schedule.training, model.schedule.rays_per_mpi) == ("two-phase", "split")
