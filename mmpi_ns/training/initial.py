@@ -21,7 +21,7 @@ from mmpi_ns.utils.random_draws import generator
 
 BATCHES, BATCH = 20, 4096
 """Batches of rays that vote, and pixel rays of a batch; rays of new views come on top."""
-PRIOR = 64.0
+PRIOR = 16.0
 """Number of votes of the prior, equal weights of all planes."""
 PLANE_ERROR = 0.6
 """Minimum error of a depth, in plane spacings: a surface between two planes is on both."""
