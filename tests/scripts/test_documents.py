@@ -3,11 +3,13 @@ and docs/results are those that ``make results`` made."""
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from importlib.metadata import entry_points, version
 from pathlib import Path
 
+import lab
 import pytest
 from report import read_json
 from results import TABLES, finished, read_tables, readme_table, results_page
@@ -45,3 +47,27 @@ def test_tables_are_those_that_were_measured():
     for page, expected in (("README.md", readme_table(made, scored)), ("docs/results/README.md", results_page(made))):
         text = (ROOT / page).read_text(encoding="utf-8")
         assert re.findall(r"<!-- results -->\n\n(.*?)\n\n<!-- /results -->", text, re.DOTALL) == [expected]
+
+
+@pytest.mark.parametrize("resumes", [True, False])
+def test_an_interrupted_training_of_a_table_resumes_or_starts_anew(resumes, monkeypatch, tmp_path):
+    checkpoint = tmp_path / "run" / "mmpi" / "1" / "nerfstudio_models" / "step-000000009.ckpt"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.touch()
+    asked = []
+
+    def as_if_run(words, log, threads, **variables):
+        asked.append([words, checkpoint.exists()])
+        (tmp_path / "eval.json").write_text(json.dumps({"results": {"psnr": 20.0}}))
+        return lab.Used(3.0, 2.0, 1.0)
+
+    monkeypatch.setattr(lab, "run_command", as_if_run)
+    scene = lab.Scene(tmp_path, 1)
+    run, results, row = lab.train_and_evaluate(scene, tmp_path, "mmpi", [], [], 1, resumes)
+    (train, kept), (evaluate, _) = asked
+    assert kept == resumes and ("--load-dir" in train) == resumes
+    if resumes:
+        assert train[train.index("--load-dir") + 1] == str(checkpoint.parent)
+    assert str(run / "config.yml") in evaluate and results == {"psnr": 20.0}
+    # What both parts took together is not known.
+    assert row.get("processor_seconds") == (None if resumes else 2.0)
