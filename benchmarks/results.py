@@ -278,7 +278,7 @@ def draw(path: Path, made: dict[str, Row], scored: Row) -> None:
     kinds: tuple[tuple[str, list[Row], str, str], ...] = (
         ("mmpi, more and more steps", lengths, "o-", "processor_seconds"),
         ("mmpi-kitti (paper)", paper, "s", "processor_seconds"),
-        ("OpenSplat", peers(scored, capture), "^", "seconds"),
+        ("OpenSplat, two processors", peers(scored, capture), "^", "seconds"),
     )
     ticks = (30, 60, 120, 300, 600, 1200, 3600)
     with figure(path, 1, 2, (9, 3.4)) as (axes,):
